@@ -24,7 +24,6 @@ from mixpose.pictures.canvas import line_height
 from mixpose.pictures.movie import Overlay, VideoSink
 from mixpose.pictures.overlay import (
     AXES,
-    CHI2_95,
     MEASURED,
     STATUS_COLOURS,
     ellipse_95,
@@ -35,7 +34,7 @@ from mixpose.pictures.scene import backdrop, draw_ranges, draw_scene
 from mixpose.pictures.signature import is_ours
 from mixpose.pictures.stages import fitted
 from mixpose.records import Estimate, FrameSet, PointPattern, RawFrame, SensorReport
-from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform
+from mixpose.rigid import CHI2_95, from_parts, from_rotation_vector, perturb, transform
 from mixpose.runner import run
 from mixpose.selection import Selection
 from mixpose.sensors import PinholeCamera, RangeSensor

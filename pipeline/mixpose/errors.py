@@ -43,3 +43,13 @@ def require_package(what: str, package: str, extra: str, more: str = "") -> None
             f"{what}: needs the package {package}; install it with: "
             f"python -m pip install 'mixpose[{extra}]'{more}"
         )
+
+
+def require_plots(what: str) -> None:
+    """Raise a SessionError if matplotlib is missing, which `what` needs."""
+    try:
+        import matplotlib.figure  # noqa: F401, PLC0415 - an extra
+    except ImportError as error:
+        raise SessionError(
+            f"{what} matplotlib, which is not installed; pip install 'mixpose[plots]'"
+        ) from error

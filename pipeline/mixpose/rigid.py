@@ -25,7 +25,7 @@ from mixpose.records import Floats
 TWIST_NAMES = ("x", "y", "z", "rx", "ry", "rz")
 
 _NEXT = np.array([1, 2, 0])  # the axis that follows each axis
-_CHI2_95 = 7.815  # 95 % quantile for three degrees of freedom
+CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815}  # 95 % quantiles of χ² by degrees of freedom
 
 
 def transform(T_a_b: Floats, points_b: Floats) -> Floats:
@@ -150,7 +150,7 @@ def position_ellipsoid_95(covariance: Floats) -> tuple[Floats, Floats]:
     """
     variances, axes = np.linalg.eigh(covariance[:3, :3])
     axes[:, 0] *= np.linalg.det(axes)  # right-handed, so that it is a rotation
-    return np.sqrt(_CHI2_95 * np.maximum(variances, 0.0)), np.asarray(axes)
+    return np.sqrt(CHI2_95[3] * np.maximum(variances, 0.0)), np.asarray(axes)
 
 
 def quaternion_xyzw(T_a_b: Floats) -> Floats:

@@ -8,15 +8,15 @@ _SIMULATION = (
     Mutant(
         "simulation-averted-features-are-seen",
         "simulation/visible_spots.py",
-        "return sensors.facing(sensor, M,",
-        "return ~sensors.facing(sensor, M,",
+        "return sensors.facing(sensor, T_world_object,",
+        "return ~sensors.facing(sensor, T_world_object,",
         "recordings show the back of the body",
     ),
     Mutant(
         "simulation-nothing-hidden-for-certain",
         "simulation/visible_spots.py",
-        "hidden[rng.permutation(count)[: options.hidden_count]] = True",
-        "hidden[rng.permutation(count)[:0]] = True",
+        "seen[rng.permutation(len(seen))[: options.hidden_count]] = False",
+        "seen[rng.permutation(len(seen))[:0]] = False",
         "hidden_count does nothing",
     ),
     Mutant(
@@ -113,8 +113,8 @@ _SIMULATION = (
     Mutant(
         "simulation-weightless-frames-left-out",
         "simulation/render.py",
-        "points, weights = np.zeros((1, len(self._coordinates))), np.zeros(1)",
-        "points, weights = np.zeros((0, len(self._coordinates))), np.zeros(0)",
+        "points, weights = np.zeros((1, len(coordinates))), np.zeros(1)",
+        "points, weights = np.zeros((0, len(coordinates))), np.zeros(0)",
         "a frame without detections is missing from its table",
     ),
 )
@@ -239,8 +239,8 @@ _CHECKING = (
     Mutant(
         "checking-no-small-bodies",
         "checking/placement.py",
-        "if extent > _SMALL * setup.extract.sigma:",
-        "if extent > 0 * setup.extract.sigma:",
+        "if extent <= _SMALL * setup.extract.sigma:",
+        "if extent <= 0 * setup.extract.sigma:",
         "two units of length in one file are not noticed",
     ),
     Mutant(

@@ -264,7 +264,7 @@ HARMLESS: tuple[Harmless, ...] = (
         "what is across it, and in its plane, hangs on its direction alone",
     ),
     Harmless(
-        "design/poses.py",
+        "design/study.py",
         "drawn = qmc.Halton(6, rng=np.random.default_rng(seed)).random(count)",
         "drawn = qmc.Halton(12, rng=np.random.default_rng(seed)).random(count)",
         "six of twelve columns are as evenly spread",

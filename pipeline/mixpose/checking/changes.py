@@ -86,28 +86,20 @@ def changes(session: Session) -> Iterator[Change]:
     sensors: dict[str, Any] = {setup.name: setup.sensor for setup in cameras}
     yield from _inversions(sensors)
     for a, b in combinations(sensors, 2):
-        yield Change(
-            f"{a!r} and {b!r} {{are}} swapped",
-            "with the source of each given to the other",
-            partial(_swapped, other={a: b, b: a}),
-        )
+        remedy, swap = "with the source of each given to the other", {a: b, b: a}
+        yield Change(f"{a!r} and {b!r} {{are}} swapped", remedy, partial(_swapped, other=swap))
     for a, b in combinations(sensors, 2):
         if type(sensors[a]) is type(sensors[b]):
-            yield _sensor_change(
-                f"calibrations of {a!r} and {b!r} {{are}} swapped",
-                "with camera_matrix and distortion of each given to the other",
-                (a, b),
-                partial(_with_lens, lenses={a: sensors[b], b: sensors[a]}),
-            )
+            what = f"calibrations of {a!r} and {b!r} {{are}} swapped"
+            remedy = "with camera_matrix and distortion of each given to the other"
+            swapped = partial(_with_lens, lenses={a: sensors[b], b: sensors[a]})
+            yield _sensor_change(what, remedy, (a, b), swapped)
     yield from _flips(cameras, "mirrored", "left and right", 0)
     for names in _all_or_one(list(sensors)):
         for factor, images, done in ((2.0, "half", "doubled"), (0.5, "twice", "halved")):
-            yield _sensor_change(
-                f"camera_matrix of {quoted(names)} {{is}} that of images {images} as large",
-                f"with fx, fy, cx and cy {done}",
-                names,
-                partial(_scaled, factor=factor),
-            )
+            what = f"camera_matrix of {quoted(names)} {{is}} that of images {images} as large"
+            remedy = f"with fx, fy, cx and cy {done}"
+            yield _sensor_change(what, remedy, names, partial(_scaled, factor=factor))
     if len(cameras) > 1:  # for one camera it is a mirror image and half a turn
         for change in _flips(cameras, "upside down", "top and bottom", 1):
             yield replace(change, leads=False)
@@ -123,12 +115,8 @@ def _flips(cameras: Sequence[SensorSetup], what: str, ends: str, axis: int) -> I
         return _with_points(view, lambda points: np.where(is_flipped, last - points, points))
 
     for names in _all_or_one(list(sized)):
-        yield _sensor_change(
-            f"images of {quoted(names)} {{are}} {what}",
-            f"with {ends} of them exchanged",
-            names,
-            flipped,
-        )
+        remedy = f"with {ends} of them exchanged"
+        yield _sensor_change(f"images of {quoted(names)} {{are}} {what}", remedy, names, flipped)
 
 
 def _sensor_change(
@@ -159,12 +147,9 @@ def _with_lens(view: View, lenses: Mapping[str, Any]) -> View:
 def _sensor_units(what: str, names: Sequence[str], views: Sequence[str]) -> Iterator[Change]:
     """Yield changes of the unit of length in which sensors measure."""
     for factor, scaled in _UNITS if names else ():
-        yield _sensor_change(
-            f"the {what} of {quoted(names)} {{are}} in another unit than the session",
-            f"with them {scaled}",
-            views,
-            partial(_with_points, changed=partial(np.multiply, factor)),
-        )
+        wrong = f"the {what} of {quoted(names)} {{are}} in another unit than the session"
+        changed = partial(_with_points, changed=partial(np.multiply, factor))
+        yield _sensor_change(wrong, f"with them {scaled}", views, changed)
 
 
 def _body_changes(body: Body) -> Iterator[Change]:
@@ -187,11 +172,8 @@ def _body_changes(body: Body) -> Iterator[Change]:
 def point_units(body: Body) -> Iterator[Change]:
     """Yield changes of the unit of the body's points alone, say metres for millimetres."""
     for factor, scaled in _UNITS:
-        yield Change(
-            "points and translations {are} in two units of length",
-            f"with points {scaled}",
-            body=partial(of_size, factor=factor),
-        )
+        what = "points and translations {are} in two units of length"
+        yield Change(what, f"with points {scaled}", body=partial(of_size, factor=factor))
 
 
 def _all_or_one(names: Sequence[str]) -> list[list[str]]:
@@ -272,12 +254,9 @@ def by_cameras_alone(session: Session, frames: Frames) -> Iterator[Change]:
             sensor, T_alone = cameras[name]
             T_other = next(T for other, (_, T) in cameras.items() if other != name)
             T = sensor.T_sensor_world @ T_alone @ inverse(T_other)
-            moved = _sensor_change(
-                misplaced(setup),
-                moved_by(sensor.T_sensor_world, T, session.unit),
-                [name],
-                partial(_with, T_sensor_world=T),
-            )
+            remedy = moved_by(sensor.T_sensor_world, T, session.unit)
+            change = partial(_with, T_sensor_world=T)
+            moved = _sensor_change(misplaced(setup), remedy, [name], change)
             yield replace(moved, cost=3 * math.log(2 * len(session.body) * len(alone)), values=6)
 
 
@@ -295,12 +274,8 @@ def _other_sizes(session: Session, alone: Sequence[dict[str, Any]]) -> Iterator[
             sizes.append(float(shift @ T_ba[:3, 3] / max(float(shift @ shift), 1e-300)))
     size, (least, most) = float(np.median(sizes or [1.0])), _OTHER_SIZE
     if abs(size - 1) > least and 1 / most < size < most:
-        yield Change(
-            OTHER_SIZE,
-            f"with points {times_as_large(size)}",
-            body=lambda body: of_size(body, size),
-            values=1,
-        )
+        remedy = f"with points {times_as_large(size)}"
+        yield Change(OTHER_SIZE, remedy, body=partial(of_size, factor=size), values=1)
 
 
 def _alone(session: Session, number: int, view: View) -> Floats | None:

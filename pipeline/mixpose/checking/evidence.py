@@ -99,11 +99,8 @@ def is_explained(pose: ScoredPose, rules: DiagnosisRules) -> bool:
     # a feature or two there could be met under any change
     in_view = np.where(matches.expected >= _FEW, matches.expected, matches.expected.max())
     could = np.minimum(matches.count, in_view)
-    return bool(
-        pose.log_evidence > rules.sure
-        and not pose.left_out
-        and (matches.met >= rules.met * could).all()
-    )
+    is_sure = pose.log_evidence > rules.sure and not pose.left_out
+    return bool(is_sure and (matches.met >= rules.met * could).all())
 
 
 def is_well_explained(pose: ScoredPose | None, rules: DiagnosisRules) -> bool:

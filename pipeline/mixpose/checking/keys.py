@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
@@ -151,12 +151,11 @@ def _extracted(
 
 def key_warnings(session: Session) -> list[str]:
     """Warn of calibrations, widths and lines, for a session with the sizes of recorded images."""
-    return _off_centre(session) + _too_wide(session) + _lines_as_points(session)
+    return [*_off_centre(session), *_too_wide(session), *_lines_as_points(session)]
 
 
-def _off_centre(session: Session) -> list[str]:
+def _off_centre(session: Session) -> Iterator[str]:
     """Warn of principal points far from the middle: a calibration of images of another size."""
-    warnings = []
     for setup in session.sensors:
         sensor = setup.sensor
         if not isinstance(sensor, Camera) or sensor.resolution is None:
@@ -164,15 +163,14 @@ def _off_centre(session: Session) -> list[str]:
         size = np.array(sensor.resolution)
         cx, cy = sensor.camera_matrix[:2, 2]
         if (np.abs((cx, cy) - (size - 1) / 2) > _OFF_CENTRE * size).any():
-            warnings.append(
+            yield (
                 f"sensor {setup.name!r}: the principal point cx = {cx:g}, cy = {cy:g} is far from "
                 f"the middle of its images of {size[0]}x{size[1]} px: is the calibration of images "
                 "of another size, and camera_matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]?"
             )
-    return warnings
 
 
-def _too_wide(session: Session) -> list[str]:
+def _too_wide(session: Session) -> Iterator[str]:
     """Warn of a sigma wider than the whole body, or than a twentieth of an image."""
     ranges, images = list[SensorSetup](), list[SensorSetup]()
     for setup in session.sensors:
@@ -184,20 +182,16 @@ def _too_wide(session: Session) -> list[str]:
     radius = f"{session.body.radius:.2g} {session.unit}"
     whole = f"the body, whose features lie within {radius}: set it to about what ranges err by"
     part = "a twentieth of the image: set it to several times what features err by, 1.5 px or so"
-    warnings = []
     for wide, unit, what in ((ranges, session.unit, whole), (images, "px", part)):
         if not wide:
             continue
         more = f" and {len(wide) - 1} more" if len(wide) > 1 else ""
         widest = max(wide, key=lambda setup: setup.extract.sigma)
         width, where = f"{widest.extract.sigma:g} {unit}", widest.table_of("sigma")
-        warnings.append(
-            f"sensor {wide[0].name!r}{more}: sigma = {width} in {where} is wider than {what}"
-        )
-    return warnings
+        yield f"sensor {wide[0].name!r}{more}: sigma = {width} in {where} is wider than {what}"
 
 
-def _lines_as_points(session: Session) -> list[str]:
+def _lines_as_points(session: Session) -> Iterator[str]:
     """Warn of cameras that extract points, though a body has segments."""
     bodies = [model.body.name for model in session.objects if not is_pointlike(model.body)]
     cameras = [
@@ -205,13 +199,12 @@ def _lines_as_points(session: Session) -> list[str]:
         for setup in session.sensors
         if setup.sensor.unit == "px" and setup.extract.method != "intensity"
     ]
-    if not (bodies and cameras):
-        return []
-    return [
-        f"{quoted(bodies)}: segments are seen as lines of grey values, and {quoted(cameras)} "
-        f'{"gives" if len(cameras) == 1 else "give"} points: set method = "intensity" in '
-        "[extract], of images, or give the ends of the lines as points"
-    ]
+    if bodies and cameras:
+        yield (
+            f"{quoted(bodies)}: segments are seen as lines of grey values, and {quoted(cameras)} "
+            f'{"gives" if len(cameras) == 1 else "give"} points: set method = "intensity" in '
+            "[extract], of images, or give the ends of the lines as points"
+        )
 
 
 def shared_source_warnings(session: Session, replaced: Mapping[str, str]) -> list[str]:

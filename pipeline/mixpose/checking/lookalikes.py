@@ -141,12 +141,9 @@ class _Nearest:
         nearest = np.where(seen[..., None], squared, np.inf)[..., chosen].argmin(axis=2)
         back = whole.y[:, None, chosen] - y[sensor, pose, nearest]
         wanted = seen[sensor, pose, nearest] & whole.seen[:, None, chosen]
-        return _least_squares(
-            np.concatenate([to - y, back], axis=2),
-            np.concatenate([J, J[sensor, pose, nearest]], axis=2),
-            np.concatenate([seen, wanted], axis=2),
-            whole.noise,
-        )
+        toward = np.concatenate([to - y, back], axis=2)
+        J_both = np.concatenate([J, J[sensor, pose, nearest]], axis=2)
+        return _least_squares(toward, J_both, np.concatenate([seen, wanted], axis=2), whole.noise)
 
     def misfit(self, poses: Floats) -> Floats:
         """Return the mean squared distance (H,) of points from the nearest measured, in noise."""

@@ -5,7 +5,7 @@ If the session has no start, typical poses have the body in view, turned at rand
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import combinations
 from typing import TypeAlias
@@ -55,89 +55,81 @@ def placement_lines(setup: SensorSetup, unit: str) -> list[str]:
 
 def placement_warnings(session: Session) -> list[str]:
     """Warn of what is most likely wrong about the poses of sensors and body, a line each."""
-    warnings = _coincident(session) + _too_large(session)
-    if session.start is None:
-        return warnings + _no_common_view(session)
+    at_start = _no_common_view if session.start is None else _out_of_view
+    return [*_coincident(session), *_too_large(session), *at_start(session)]
+
+
+def _out_of_view(session: Session) -> Iterator[str]:
+    """Warn of sensors in which the body at [start] is out of view, in part or small."""
+    assert session.start is not None
     T = session.start.T_world_object
     seen = {s.name: _seen(s.sensor, session, T) for s in session.sensors}
     unseen = [setup for setup in session.sensors if not seen[setup.name].any()]
-    hint = _inverted(session, unseen, T)
     for setup in unseen:
-        warnings.append(
-            f"sensor {setup.name!r}: the body at [start] is {_why_unseen(setup.sensor, session, T)}"
-        )
+        why = _why_unseen(setup.sensor, session, T)
+        yield f"sensor {setup.name!r}: the body at [start] is {why}"
     for setup in session.sensors:
         count = int(seen[setup.name].sum())
         if 0 < count < len(session.body) / 2:
-            warnings.append(
+            yield (
                 f"sensor {setup.name!r}: only {count} of {len(session.body)} features are in view "
                 "at [start]"
             )
-        warnings += _too_small(setup, session, T, seen[setup.name])
-    return warnings + hint
+        yield from _too_small(setup, session, T, seen[setup.name])
+    yield from _inverted(session, unseen, T)
 
 
-def _coincident(session: Session) -> list[str]:
+def _coincident(session: Session) -> Iterator[str]:
     """Warn of sensors with the same place and orientation, or too near to each other."""
-    warnings = []
     for a, b in combinations(session.sensors, 2):
         if isinstance(a.sensor, RangeSensor) and isinstance(b.sensor, RangeSensor):
             if np.array_equal(a.sensor.position, b.sensor.position):
-                warnings.append(
-                    f"sensors {a.name!r} and {b.name!r} stand at one position: check position"
-                )
+                yield f"sensors {a.name!r} and {b.name!r} stand at one position: check position"
         elif isinstance(a.sensor, Looking) and isinstance(b.sensor, Looking):
             T_a, T_b = a.sensor.T_sensor_world, b.sensor.T_sensor_world
             distance = np.linalg.norm(T_a[:3, 3] - T_b[:3, 3])
             is_near = distance <= 1e-6 * max(session.body.radius, float(np.linalg.norm(T_a[:3, 3])))
             if is_near and rotation_angle_deg(T_a, T_b) < _SAME_ANGLE_DEG:
-                warnings.append(
+                yield (
                     f"sensors {a.name!r} and {b.name!r} stand at one place and look the same way: "
                     "does one of them lack its T_sensor_world?"
                 )
-            else:
-                warnings += _too_near(a, b, session)
-    return warnings
+            elif isinstance(a.sensor, Camera) and isinstance(b.sensor, Camera):
+                apart = float(np.linalg.norm(_centre(a.sensor) - _centre(b.sensor)))
+                if apart * session.metres_per_unit <= _LENSES_APART_M:
+                    yield (
+                        f"sensors {a.name!r} and {b.name!r} stand {apart:.2g} {session.unit} "
+                        f"apart, less than two lenses need: are translations in {session.unit}? "
+                        "Kalibr, ROS and caliscope write metres"
+                    )
 
 
-def _too_near(a: SensorSetup, b: SensorSetup, session: Session) -> list[str]:
-    """Warn of cameras nearer to each other than lenses allow: lengths in another unit."""
-    if not (isinstance(a.sensor, Camera) and isinstance(b.sensor, Camera)):
-        return []
-    apart = float(np.linalg.norm(_centre(a.sensor) - _centre(b.sensor)))
-    if apart * session.metres_per_unit > _LENSES_APART_M:
-        return []
-    return [
-        f"sensors {a.name!r} and {b.name!r} stand {apart:.2g} {session.unit} apart, less than two "
-        f"lenses need: are translations in {session.unit}? Kalibr, ROS and caliscope write metres"
-    ]
-
-
-def _too_large(session: Session) -> list[str]:
+def _too_large(session: Session) -> Iterator[str]:
     """Warn of bodies larger than is likely: lengths in another unit than the session says."""
-    sizes = {model.body.name: 2 * model.body.radius for model in session.objects}
-    return [
-        f"the body {name!r} is {float(f'{width:.3g}'):g} {session.unit} across: is unit = "
-        f'"{session.unit}" that of points and translations?'
-        for name, width in sizes.items()
-        if width * session.metres_per_unit > _LARGEST_M
-    ]
+    widths = {model.body.name: 2 * model.body.radius for model in session.objects}
+    for name, width in widths.items():
+        if width * session.metres_per_unit > _LARGEST_M:
+            yield (
+                f"the body {name!r} is {float(f'{width:.3g}'):g} {session.unit} across: is unit = "
+                f'"{session.unit}" that of points and translations?'
+            )
 
 
-def _no_common_view(session: Session) -> list[str]:
+def _no_common_view(session: Session) -> Iterator[str]:
     """Warn of cameras that have no common view of the body."""
     cameras = [setup for setup in session.sensors if isinstance(setup.sensor, Looking)]
     blind = _blind(session, cameras)
     if len(cameras) < 2 or not blind:
-        return []
+        return
     names = ", ".join(repr(setup.name) for setup in blind)
     text = f"{names} would not see the body where the other sensors look"
     if len(blind) == len(cameras):
         text = f"no place was found that is in view of {names}"
     flipped = [replace(s, sensor=_with_inverse(s.sensor)) for s in cameras]
     if not _blind(replace(session, sensors=tuple(flipped)), flipped):
-        return [f"{text}; with the inverse of each T_sensor_world all would: {_MAPS}"]
-    return [f"{text}: check T_sensor_world{_sizes(session, cameras)}"]
+        yield f"{text}; with the inverse of each T_sensor_world all would: {_MAPS}"
+    else:
+        yield f"{text}: check T_sensor_world{_sizes(session, cameras)}"
 
 
 def _sizes(session: Session, cameras: list[SensorSetup]) -> str:
@@ -161,10 +153,10 @@ def _blind(session: Session, cameras: list[SensorSetup]) -> list[SensorSetup]:
     return [setup for setup in cameras if not _seen(setup.sensor, session, poses[0]).any()]
 
 
-def _inverted(session: Session, unseen: list[SensorSetup], T_start: Floats) -> list[str]:
+def _inverted(session: Session, unseen: list[SensorSetup], T_start: Floats) -> Iterator[str]:
     """Hint at a pose in the session whose inverse would put the body in view."""
     if not unseen:
-        return []
+        return
     cameras = {s.name: s.sensor for s in session.sensors if isinstance(s.sensor, Looking)}
     placed = {n: s for n, s in cameras.items() if not np.allclose(s.T_sensor_world, np.eye(4))}
     names = {setup.name for setup in unseen}
@@ -172,19 +164,19 @@ def _inverted(session: Session, unseen: list[SensorSetup], T_start: Floats) -> l
     if placed and names.issuperset(placed):
         flipped = map(_with_inverse, placed.values())
         if all(_seen(sensor, session, T_start).all() for sensor in flipped):
-            return [
+            yield (
                 "T_sensor_world looks inverted: with its inverse the body at [start] would be in "
                 f"view of {', '.join(map(repr, placed))}; {_MAPS}"
-            ]
+            )
+            return
     T_inverse = inverse(T_start)
     if len(unseen) == len(session.sensors) and all(
         _seen(sensor, session, T_inverse).all() for sensor in cameras.values()
     ):
-        return [
+        yield (
             "start.T_world_object looks inverted: with its inverse the body would be in view of "
             "all cameras; it maps object to world coordinates"
-        ]
-    return []
+        )
 
 
 def _with_inverse(sensor: Sensor) -> Sensor:
@@ -209,18 +201,17 @@ def _why_unseen(sensor: Sensor, session: Session, T_start: Floats) -> str:
     return f"out of its view: {keys}"
 
 
-def _too_small(setup: SensorSetup, session: Session, T_start: Floats, seen: Mask) -> list[str]:
+def _too_small(setup: SensorSetup, session: Session, T_start: Floats, seen: Mask) -> Iterator[str]:
     """Warn of a body of a few pixels: mostly two units of length in one file."""
-    if not isinstance(setup.sensor, Looking) or not seen.any():
-        return []
+    if not isinstance(setup.sensor, Looking) or seen.sum() < 2:
+        return
     y, _ = setup.sensor.project(transform(T_start, session.body.means))
-    extent = float(np.ptp(y[seen], axis=0).max()) if seen.sum() > 1 else np.inf
-    if extent > _SMALL * setup.extract.sigma:
-        return []
-    return [
-        f"sensor {setup.name!r}: the body at [start] is {extent:.2g} px wide: are points, "
-        f"translation and T_sensor_world all in {session.unit}?"
-    ]
+    extent = float(np.ptp(y[seen], axis=0).max())
+    if extent <= _SMALL * setup.extract.sigma:
+        yield (
+            f"sensor {setup.name!r}: the body at [start] is {extent:.2g} px wide: are points, "
+            f"translation and T_sensor_world all in {session.unit}?"
+        )
 
 
 def expected_count(setup: SensorSetup, session: Session) -> int:

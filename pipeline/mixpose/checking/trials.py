@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import chain, pairwise, takewhile
 from operator import itemgetter
 from typing import Any, NamedTuple, TypeAlias
@@ -266,15 +267,8 @@ def _fitted(
     explained, count = Explained(tuple(after)), len(values)
     unlikely = float(((values / unknown.deviations) ** 2).sum())
     cost = 0.5 * (count * math.log(max(2 * explained.met_count(), 2.0)) + unlikely)
-    change = Change(
-        unknown.what,
-        unknown.remedy(values),
-        lambda views: _with(unknown, values, views),
-        lambda _: body,
-        cost=cost,
-        values=count,
-        feature=unknown.feature,
-    )
+    changed, remedy = partial(_with, unknown, values), unknown.remedy(values)
+    change = Change(unknown.what, remedy, changed, lambda _: body, cost, count, unknown.feature)
     yield Tried(change, explained, explained.evidence - before.evidence - cost - unknown.cost)
 
 

@@ -81,9 +81,9 @@ def _require_room(request: DesignRequest, sessions: Sequence[Path]) -> None:
     output.refuse_stdout(request.plot, "--plot", "a picture", "a file, as --plot study.png")
     output.refuse_one_for_two(request.plot, "--plot", request.json, "--json")
     if request.plot is not None:
-        from mixpose.design.plot import require_plots  # noqa: PLC0415
+        from mixpose.design.plot import require_picture  # noqa: PLC0415
 
-        require_plots(request.plot)
+        require_picture(request.plot)
         if not request.plot.parent.is_dir():
             raise SessionError(f"--plot {request.plot}: there is no folder {request.plot.parent}")
         refuse_foreign(request.plot, "--plot")

@@ -12,9 +12,9 @@ from mixpose.cli.app import InspectRequest
 from mixpose.cli.output import print_lines, refuse_stdout
 from mixpose.cli.run import named_sources
 from mixpose.cli.session_formats import recording_of
-from mixpose.errors import RecordingError, SessionError, reporting
+from mixpose.errors import RecordingError, SessionError, reporting, require_plots
 from mixpose.frames import Source, pair
-from mixpose.pictures import advice, finding, plots, scene, sheet, signature
+from mixpose.pictures import advice, finding, scene, sheet, signature
 from mixpose.pictures.canvas import Picture
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.records import Estimate, FrameSet, PointPattern
@@ -28,7 +28,7 @@ def inspect_frame(request: InspectRequest) -> None:
     folder, poses = request.output, request.poses
     refuse_stdout(folder, "-o", "pictures", "a folder, as -o seen")
     session = load_session(request.session, allow_code=request.allow_code)
-    plots.require_matplotlib()
+    require_plots("inspect: plots need")
     _check_folder(folder, session)
     pose_file, named = None if poses is None else read_poses(poses), request.source or ()
     if pose_file is None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mixpose.design.study import Study
-from mixpose.errors import SessionError
+from mixpose.errors import SessionError, require_plots
 from mixpose.records import Floats
 from mixpose.rigid import TWIST_NAMES
 
@@ -18,39 +18,26 @@ if TYPE_CHECKING:
 _SUFFIXES = (".png", ".svg", ".pdf")
 
 
-def require_plots(path: Path) -> None:
-    """Check that a picture can be drawn, before anything is computed for it.
-
-    Raises a SessionError if matplotlib is not installed, or does not write such files.
-    """
+def require_picture(path: Path) -> None:
+    """Raise a SessionError if matplotlib is not installed, or does not write such files."""
     if path.suffix.lower() not in _SUFFIXES:
         raise SessionError(f"--plot {path}: found {path.suffix!r}; allowed: {', '.join(_SUFFIXES)}")
-    try:
-        import matplotlib.figure  # noqa: F401, PLC0415
-    except ImportError as error:
-        raise SessionError(
-            "design: --plot needs matplotlib, which is not installed; pip install 'mixpose[plots]'"
-        ) from error
+    require_plots("design: --plot needs")
 
 
 def draw_study(study: Study, path: Path) -> None:
     """Write a picture of a study."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415 - heavy, and an extra
 
     count = len(study.systems)
     figure = Figure(figsize=(11, 3.2 * (1 + count)), layout="constrained")
-    FigureCanvasAgg(figure)
     rows: Any = figure.subfigures(1 + count, 1)
     _bars(list(rows[0].subplots(1, 2)), study)
-    largest = max(
-        (float(s.summary.tip[np.isfinite(s.summary.tip)].max(initial=0.0)) for s in study.systems),
-        default=1.0,
-    )
-    for row, system in zip(rows[1:], study.systems, strict=True):
+    tips = [system.summary.tip for system in study.systems]
+    largest = max(float(tip[np.isfinite(tip)].max(initial=0.0)) for tip in tips)
+    for row, system, tip in zip(rows[1:], study.systems, tips, strict=True):
         row.suptitle(f"{system.name}: error of the tip over the volume", parse_math=False)
-        axes = list(row.subplots(1, 3))
-        _maps(axes, study, system.summary.tip, largest)
+        _maps(list(row.subplots(1, 3)), study, tip, largest)
     figure.savefig(path)
 
 
@@ -65,11 +52,10 @@ def _bars(axes: list[Axes], study: Study) -> None:
             values = np.where(np.isfinite(values), values, np.nan)
             if np.isnan(values).all():
                 continue
-            medians = np.nanmedian(values, axis=0)
-            worst = np.nanmax(values, axis=0)
             positions = np.arange(3) + (k - (len(study.systems) - 1) / 2) * width
+            medians = np.nanmedian(values, axis=0)
             axis.bar(positions, medians, width, label=system.name, color=f"C{k}")
-            axis.plot(positions, worst, "_", color="black", markersize=12)
+            axis.plot(positions, np.nanmax(values, axis=0), "_", color="black", markersize=12)
         axis.set_xticks(range(3), [TWIST_NAMES[d] for d in directions])
         axis.set_ylabel(f"deviation, {unit}: median, worst")
     for name in axes[0].legend().get_texts():
@@ -81,10 +67,8 @@ def _maps(axes: list[Axes], study: Study, errors: Floats, largest: float) -> Non
     known = np.isfinite(errors)
     for axis, (i, j) in zip(axes, ((0, 1), (0, 2), (1, 2)), strict=True):
         axis.plot(positions[~known, i], positions[~known, j], "x", color="0.5")
-        points = axis.scatter(
-            positions[known, i], positions[known, j], c=errors[known], vmin=0, vmax=largest or 1.0
-        )
-        axis.set_xlabel(f"{TWIST_NAMES[i]}, {study.unit}")
-        axis.set_ylabel(f"{TWIST_NAMES[j]}, {study.unit}")
+        x, y = positions[known][:, [i, j]].T
+        points = axis.scatter(x, y, c=errors[known], vmin=0, vmax=largest or 1.0)
+        axis.set(xlabel=f"{TWIST_NAMES[i]}, {study.unit}", ylabel=f"{TWIST_NAMES[j]}, {study.unit}")
         axis.set_aspect("equal", adjustable="datalim")
     axes[0].figure.colorbar(points, ax=axes, label=study.unit)

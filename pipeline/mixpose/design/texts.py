@@ -44,7 +44,8 @@ def _system_lines(system: System, study: Study) -> Iterator[tuple[str, str]]:
     """Yield titles and texts of a system's lines."""
     summary, plan, unit = system.summary, system.plan, study.unit
     yield "deviation", _deviations_text(summary, plan, unit)
-    yield "error", _errors_text(summary, unit, with_tip=study.request.tip is not None)
+    worst = f" (worst {_number(summary.tip.max())})" if study.request.tip is not None else ""
+    yield "error", ", ".join(map(" ".join, _errors(summary, study))) + worst
     if summary.weakest_position is not None:
         yield "weakest", _weakness_text(summary.weakest_position, unit, 1.0)
     if summary.weakest_rotation is not None:
@@ -111,15 +112,14 @@ def _deviations_text(summary: Summary, plan: Plan, unit: str) -> str:
     return f"median/worst: {', '.join(parts)}"
 
 
-def _errors_text(summary: Summary, unit: str, *, with_tip: bool) -> str:
-    parts = [
-        f"position {_number(pooled(summary.position))} {unit}",
-        f"rotation {_number(pooled(summary.rotation) * _DEGREES)} deg",
+def _errors(summary: Summary, study: Study) -> list[tuple[str, str, str]]:
+    """Return what errs, by how much, and in which unit; last the tip, if there is one."""
+    errors = [
+        ("position", _number(pooled(summary.position)), study.unit),
+        ("rotation", _number(pooled(summary.rotation) * _DEGREES), "deg"),
+        ("tip", _number(pooled(summary.tip)), study.unit),
     ]
-    if with_tip:
-        worst = _number(summary.tip.max())
-        parts.append(f"tip {_number(pooled(summary.tip))} {unit} (worst {worst})")
-    return ", ".join(parts)
+    return errors[:2] if study.request.tip is None else errors
 
 
 def _weakness_text(weakness: Weakness, unit: str, scale: float) -> str:
@@ -154,17 +154,12 @@ def _confirmation_text(result: Confirmation, plan: Plan) -> str:
 
 def _comparison(study: Study) -> list[str]:
     systems = study.systems
-    summaries = [system.summary for system in systems]
-    rows = [
-        (f"position, {study.unit}", [summary.position for summary in summaries]),
-        ("rotation, deg", [summary.rotation * _DEGREES for summary in summaries]),
-    ]
-    if study.request.tip is not None:
-        rows.append((f"tip, {study.unit}", [summary.tip for summary in summaries]))
     width = max(12, *(len(system.name) + 2 for system in systems))
-    cells = [("", [system.name for system in systems])]
-    cells += [(title, [_number(pooled(error)) for error in errors]) for title, errors in rows]
-    lines = [f"{title:<16}" + "".join(f"{cell:>{width}}" for cell in row) for title, row in cells]
+    rows = [("", [system.name for system in systems])]
+    for errors in zip(*(_errors(system.summary, study) for system in systems), strict=True):
+        what, _, unit = errors[0]
+        rows.append((f"{what}, {unit}", [error for _, error, _ in errors]))
+    lines = [f"{title:<16}" + "".join(f"{cell:>{width}}" for cell in row) for title, row in rows]
     for system in systems[1:]:
         assert system.equal is not None, "all but the first are compared"
         lines.append(_equal_text(system, system.equal, systems[0].name, study.unit))
@@ -220,25 +215,22 @@ JSON_MARK = '"type": "design"'
 
 def study_json(study: Study) -> dict[str, Any]:
     """Return a study as JSON; what is not determined is null."""
-    congruent = [
-        {
-            "bodies": [alike.body.name, alike.other.name],
-            "markers": list(zip(alike.features, alike.partners, strict=True)),
-            "misfit": alike.off,
-        }
-        for alike in study.congruences
-    ]
-    document: dict[str, Any] = plain(
-        {
-            "type": "design",
-            "unit": study.unit,
-            "tip": study.request.tip,
-            "poses": study.request.poses,
-            "systems": [_system_json(system) for system in study.systems],
-            "congruent": congruent,
-        }
-    )
-    return document
+    document: dict[str, Any] = {
+        "type": "design",
+        "unit": study.unit,
+        "tip": study.request.tip,
+        "poses": study.request.poses,
+        "systems": [_system_json(system) for system in study.systems],
+        "congruent": [
+            {
+                "bodies": [alike.body.name, alike.other.name],
+                "markers": list(zip(alike.features, alike.partners, strict=True)),
+                "misfit": alike.off,
+            }
+            for alike in study.congruences
+        ],
+    }
+    return {key: plain(value) for key, value in document.items()}
 
 
 def _system_json(system: System) -> dict[str, Any]:
@@ -261,10 +253,11 @@ def _system_json(system: System) -> dict[str, Any]:
         "weakest_position": summary.weakest_position and asdict(summary.weakest_position),
         "weakest_rotation": summary.weakest_rotation and asdict(summary.weakest_rotation),
     }
-    if system.confirmation is not None:
-        result["simulated"] = _confirmation_json(system.confirmation)
-    if system.equal is not None:
-        result["equals_first_with"] = _equal_json(system.equal, plan)
+    result |= _simulated_json(system.confirmation)
+    if (equal := system.equal) is not None:
+        noise = {} if equal.factor is None else {"noise": _by_sensor(plan, equal.noises)}
+        stated = {"factor": equal.factor, "error": equal.wanted, **noise}
+        result["equals_first_with"] = stated | _simulated_json(equal.confirmation)
     if move is not None:
         marker = plan.body.labels[move.marker]
         result["move_marker"] = {"marker": marker, "shift": move.shift, "error": move.error}
@@ -279,16 +272,10 @@ def _by_sensor(plan: Plan, values: Iterable[float]) -> dict[str, float]:
     return dict(zip(plan.names, values, strict=True))
 
 
-def _confirmation_json(result: Confirmation) -> dict[str, Any]:
-    names = ("position", "rotation", "tip")
-    errors = (dict(zip(names, part, strict=True)) for part in (result.predicted, result.found))
-    return asdict(result) | dict(zip(("predicted", "found"), errors, strict=True))
-
-
-def _equal_json(equal: Equal, plan: Plan) -> dict[str, Any]:
-    result: dict[str, Any] = {"factor": equal.factor, "error": equal.wanted}
-    if equal.factor is not None:
-        result["noise"] = _by_sensor(plan, equal.noises)
-    if equal.confirmation is not None:
-        result["simulated"] = _confirmation_json(equal.confirmation)
-    return result
+def _simulated_json(result: Confirmation | None) -> dict[str, Any]:
+    if result is None:
+        return {}
+    document = asdict(result)
+    for key in ("predicted", "found"):
+        document[key] = dict(zip(("position", "rotation", "tip"), document[key], strict=True))
+    return {"simulated": document}

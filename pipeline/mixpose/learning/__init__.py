@@ -6,8 +6,6 @@ detections  →  points in space of each frame, with ghosts  →  without points
 """
 
 from mixpose.learning.adjusting import LearntBody as LearntBody, SensorSet as SensorSet
-from mixpose.learning.axes import Alignment as Alignment
 from mixpose.learning.axes import in_marker_axes as in_marker_axes, in_axes_of as in_axes_of
 from mixpose.learning.learn import LearningResult as LearningResult
 from mixpose.learning.learn import learn as learn, learn_from as learn_from
-from mixpose.learning.rules import LearningRules as LearningRules

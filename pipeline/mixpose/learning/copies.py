@@ -39,7 +39,7 @@ def with_copies(body: PlacedBody, clouds: Sequence[Cloud]) -> PlacedBody:
     is_exclusive = _are_exclusive(shape, placements, count)
     is_foreign = _are_foreign(shape, placements, is_exclusive)
     if is_foreign.any():
-        shape = _part(shape, ~is_foreign)
+        shape = shape.part(~is_foreign)
         placements = find_placements(shape, clouds, RULES.most_bodies, _of_copy(shape))
         count = _count(shape, placements, clouds)
     while count > 1 and _are_exclusive(shape, placements, count).any():
@@ -94,7 +94,7 @@ def _in_one_piece(
     if has_rarest.all():
         return body
     is_apart = seen[~has_rarest].mean(axis=0) < _MISSED * seen[has_rarest].mean(axis=0)
-    part, remainder = _part(body.shape, is_apart), _part(body.shape, ~is_apart)
+    part, remainder = body.shape.part(is_apart), body.shape.part(~is_apart)
     if min(len(part), len(remainder)) < FEWEST:
         return body
     elsewhere = PlacedBody(part, tuple(find_placements(part, unclaimed)))
@@ -102,10 +102,6 @@ def _in_one_piece(
     if is_seldom or is_chance(elsewhere, unclaimed):
         return body
     return PlacedBody(remainder, tuple(find_placements(remainder, clouds)))
-
-
-def _part(shape: Shape, chosen: Mask) -> Shape:
-    return Shape(shape.points[chosen], shape.sigma[chosen])
 
 
 def _of_copy(shape: Shape) -> int:

@@ -41,6 +41,10 @@ class Shape:
     def __len__(self) -> int:
         return len(self.points)
 
+    def part(self, chosen: Mask) -> Shape:
+        """Return the shape of the chosen points (N,)."""
+        return Shape(self.points[chosen], self.sigma[chosen])
+
 
 @dataclass(frozen=True, eq=False)
 class Placement:
@@ -313,10 +317,8 @@ def _with_further_points(shape: Shape, placements: Placements, clouds: Sequence[
         return shape
     added = np.array([np.median(radii[rows]) / RULES.gate for _, rows in gathered])
     counts = np.array([len(rows) for _, rows in gathered], dtype=np.float64)
-    return Shape(
-        np.concatenate([shape.points, [place for place, _ in gathered]]),
-        np.concatenate([shape.sigma, _averaged_sigma(added, counts)]),
-    )
+    all_points = np.concatenate([shape.points, [place for place, _ in gathered]])
+    return Shape(all_points, np.concatenate([shape.sigma, _averaged_sigma(added, counts)]))
 
 
 def _lever(shape: Shape, points: Floats, met: int) -> Floats:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from mixpose.body import Body, PointFeature
@@ -93,60 +95,59 @@ def _threshold(light: Light) -> str:
     return f"{text}; {100 * light.share:.2g} % of the pixels"
 
 
-def _about_spots(finding: Finding, light: Light, body: Body) -> list[str]:
+def _about_spots(finding: Finding, light: Light, body: Body) -> Iterator[str]:
     """Advise on blobs and intensity."""
     options = light.options
-    lines = []
     if light.share > FLOODED and finding.points is not None and finding.count > 3 * len(body):
         stricter = change_of(options, lower=False, level=light.formatted(light.level))
         if options.method == "blobs":
             stricter += f", raise min_area = {options.min_area:g} or set max_area"
-        lines.append(
+        yield (
             f"too much of the image counts as feature: {stricter}, or set "
             'threshold = "local" where the light is uneven'
         )
     expected = finding.expectation
     if expected is None or finding.passed_over:
-        return lines + _about_number(finding, body, light)
-    lines += _about_missing(finding, expected, light, body)
+        yield from _about_number(finding, body, light)
+        return
+    yield from _about_missing(finding, expected, light, body)
     if options.method == "blobs":
-        lines += _about_extra(finding, expected, light)
-    return lines
+        yield from _about_extra(finding, expected, light)
 
 
-def _about_missing(finding: Finding, expected: Expectation, light: Light, body: Body) -> list[str]:
+def _about_missing(
+    finding: Finding, expected: Expectation, light: Light, body: Body
+) -> Iterator[str]:
     """State why expected features were not met, and which change would find them."""
     options = light.options
     missing = _sorted_out(finding, expected, light)
-    lines = []
     ground, shine = ("dark", "bright") if options.polarity == "bright" else ("bright", "dark")
     if features := missing["nothing"]:
-        lines.append(
+        yield (
             f"not met and {ground} there: {names_of(features, body)}; hidden, out of light, or the "
             "pose is wrong"
         )
     if features := missing["faint"]:
         level = (min(features.values()) + float(np.median(light.raw))) / 2  # and the background
         lower = levels.lower_level(light, level)
-        lines.append(f"not met, fainter than the threshold: {names_of(features, body)}; {lower}")
+        yield f"not met, fainter than the threshold: {names_of(features, body)}; {lower}"
     if features := missing["small"]:
         lower = change_of(options, lower=True, level=light.formatted(light.level))
-        lines.append(
+        yield (
             f"not met, too small: {names_of(features, body)}; lower min_area = "
             f"{options.min_area:g} to {min(features.values()):g}, or {lower}"
         )
     if features := missing["large"]:
-        lines.append(
+        yield (
             f"not met, too large: {names_of(features, body)}; raise max_area = "
             f"{options.max_area:g} to {max(features.values()):g}"
         )
     if features := missing["other"]:
-        lines.append(
+        yield (
             f"not met though {shine} there: {names_of(features, body)}; they run into something "
             "else, are partly hidden, have no clear shape, or are not where the object says; "
             f"{levels.threshold_apart(finding, expected, light, body, list(features))}"
         )
-    return lines
 
 
 def _sorted_out(
@@ -246,13 +247,13 @@ def _about_number(finding: Finding, body: Body, light: Light) -> list[str]:
     return []
 
 
-def _about_others(finding: Finding, body: Body) -> list[str]:
+def _about_others(finding: Finding, body: Body) -> Iterator[str]:
     """Advise on corners, unsharp spots and user-defined methods."""
     options = finding.setup.extract
     expected = finding.expectation
     if expected is None or finding.passed_over:
         if not _is_countable(finding, body):
-            return []
+            return
         has_missed, has_extra = finding.count < 0.8 * len(body), finding.count > 3 * len(body)
         missing, extra = "fewer than the object has", "far more than the object has"
     else:
@@ -263,47 +264,42 @@ def _about_others(finding: Finding, body: Body) -> list[str]:
     lower = raised = f"{options.method} does not tell them"
     if options.method in ("corners", "log"):
         lower, raised = (change_of(options, lower=way) for way in (True, False))
-    lines = []
     if has_missed:
-        lines.append(f"{missing}; hidden, or {lower}")
+        yield f"{missing}; hidden, or {lower}"
     if has_extra:
-        lines.append(f"{extra}; clutter is allowed for, or {raised}")
-    return lines
+        yield f"{extra}; clutter is allowed for, or {raised}"
 
 
-def _about_measurements(finding: Finding, body: Body) -> list[str]:
+def _about_measurements(finding: Finding, body: Body) -> Iterator[str]:
     """Advise on tables of detections and range profiles, which have no threshold."""
     expected = finding.expectation
     if finding.points is None:
-        if finding.count <= 2 * len(body) or not _is_countable(finding, body):
-            return []
-        return [
-            "far more echoes than features: noise fills the profile; take its floor off, or raise "
-            f"sigma in {finding.setup.table_of('sigma')}"
-        ]
-    if expected is None:
-        return []
-    lines = []
-    if missed := np.flatnonzero(expected.seen & ~expected.met).tolist():
-        names = names_of(missed, body)
-        lines.append(f"not met: {names}; not in the table, or farther off than sigma allows")
-    if extra := int(expected.unexplained.sum()):
-        lines.append(f"{extra} in the table belong to no feature; clutter is allowed for")
-    return lines
+        if finding.count > 2 * len(body) and _is_countable(finding, body):
+            yield (
+                "far more echoes than features: noise fills the profile; take its floor off, or "
+                f"raise sigma in {finding.setup.table_of('sigma')}"
+            )
+    elif expected is not None:
+        if missed := np.flatnonzero(expected.seen & ~expected.met).tolist():
+            names = names_of(missed, body)
+            yield f"not met: {names}; not in the table, or farther off than sigma allows"
+        if extra := int(expected.unexplained.sum()):
+            yield f"{extra} in the table belong to no feature; clutter is allowed for"
 
 
-def _about_sigma(finding: Finding) -> list[str]:
+def _about_sigma(finding: Finding) -> Iterator[str]:
     """Advise to raise sigma if residuals are larger than it."""
     expected = finding.expectation
     if expected is None or expected.rms is None or expected.rms < _LOOSE_RMS * finding.sigma:
-        return []
+        return
     if finding.setup.delay or finding.setup.readout:
-        return [
+        yield (
             "met features are off, as the sensor is late or rolling, and the pose is of the "
             "frame's own moment: one frame does not show how it moves; see the residuals of the run"
-        ]
-    return [
-        f"met features are off by more than sigma = {finding.setup.extract.sigma:g} says: raise "
-        f"sigma in {finding.setup.table_of('sigma')} to about {expected.rms:.2g}, where markers "
-        "give way on the body set sigma in [object], or check calibration and markers"
-    ]
+        )
+    else:
+        yield (
+            f"met features are off by more than sigma = {finding.setup.extract.sigma:g} says: "
+            f"raise sigma in {finding.setup.table_of('sigma')} to about {expected.rms:.2g}, where "
+            "markers give way on the body set sigma in [object], or check calibration and markers"
+        )

@@ -94,14 +94,14 @@ def find_several(
 ) -> list[list[Finding]]:
     """Compare, per body, the detections that other bodies leave unexplained with its estimate."""
     pairs = list(zip(bodies, estimates, strict=True))
-    alone = [find(setups, frames, views, body, estimate) for body, estimate in pairs]
+    alone = [find(setups, frames, views, *pair) for pair in pairs]
     if len(pairs) == 1:
         return alone
     findings = []
-    for k, (body, estimate) in enumerate(pairs):
+    for k, pair in enumerate(pairs):
         others = [finding for by_sensor in (*alone[:k], *alone[k + 1 :]) for finding in by_sensor]
         unclaimed = [_unclaimed_view(view, others) for view in views]
-        findings.append(find(setups, frames, unclaimed, body, estimate))
+        findings.append(find(setups, frames, unclaimed, *pair))
     return findings
 
 

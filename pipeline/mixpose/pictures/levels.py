@@ -80,10 +80,15 @@ class Light:
     @cached_property
     def pieces(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Connected pieces above the threshold: labels of pixels, 0 for none, and their areas."""
-        _, labels, statistics, _ = cv2.connectedComponentsWithStats(self.above)
-        areas = np.asarray(statistics[:, cv2.CC_STAT_AREA], dtype=np.int32)
-        areas[0] = 0
-        return np.asarray(labels, dtype=np.int32), areas
+        return _pieces(self.above)
+
+
+def _pieces(mask: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return the labels of the connected pieces of a mask, 0 for none, and their areas."""
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(mask)
+    areas = np.asarray(statistics[:, cv2.CC_STAT_AREA], dtype=np.int32)
+    areas[0] = 0
+    return np.asarray(labels, dtype=np.int32), areas
 
 
 def change_of(options: ExtractOptions, *, lower: bool, level: str = "") -> str:
@@ -114,8 +119,8 @@ def threshold_for_more(light: Light, expected: int) -> str:
     height = float(light.scene.level)
     counts = {}
     for level in (base + share * height for share in _LOWER):
-        statistics = cv2.connectedComponentsWithStats((light.raw > level).astype(np.uint8))[2]
-        counts[level] = int(np.count_nonzero(statistics[1:, cv2.CC_STAT_AREA] >= options.min_area))
+        _, areas = _pieces((light.raw > level).astype(np.uint8))
+        counts[level] = int(np.count_nonzero(areas[1:] >= options.min_area))
     likely = [level for level, n in counts.items() if 0.8 * expected <= n <= 3 * expected]
     for level in sorted(likely, reverse=True):
         number = light.formatted(light.in_image(level))
@@ -142,8 +147,7 @@ def threshold_apart(
     usual = float(np.median([areas[largest[i]] for i in met.tolist()] or [np.inf]))
     ground = np.median(light.raw[np.isin(labels, [largest[i] for i in features])])
     level = (peak + float(ground)) / 2
-    pieces, statistics = cv2.connectedComponentsWithStats((light.raw > level).astype(np.uint8))[1:3]
-    sizes = np.append(0, statistics[1:, cv2.CC_STAT_AREA])
+    pieces, sizes = _pieces((light.raw > level).astype(np.uint8))
     parted_sizes = {i: int(sizes[pieces[boxes[i]]].max()) for i in features}
     parted = [i for i in features if options.min_area <= parted_sizes[i] <= _AS_LARGE * usual]
     if not parted:

@@ -35,8 +35,22 @@ class Overlay:
 
     def __init__(self, session: Session, path: Path, *, resume: bool = False) -> None:
         self._session, self._is_sized = session, False
-        self._sink = _sink(path, resume)
         self._estimates: list[Estimate] = []
+        if not path.parent.is_dir():
+            raise SessionError(f"--overlay {path}: there is no folder {path.parent}")
+        suffix = path.suffix.casefold()
+        is_folder = path.is_dir() or not suffix
+        if not is_folder and suffix not in CODECS:
+            raise SessionError(
+                f"--overlay {path}: found the extension {suffix}, allowed are {', '.join(CODECS)} "
+                "for a video, and a name without one for a folder of pictures"
+            )
+        if not is_folder and resume:
+            raise SessionError(
+                f"--overlay {path}: --resume cannot go on in a video; name a folder, which gets a "
+                "picture per frame"
+            )
+        self._sink = FolderSink(path, resume=resume) if is_folder else VideoSink(path)
 
     def __enter__(self) -> Overlay:
         return self
@@ -53,26 +67,6 @@ class Overlay:
             picture = draw_scene(self._session, frame_set, *self._estimates)
             self._sink.add(picture, estimate.frame, estimate.time_s)
             self._estimates = []
-
-
-def _sink(path: Path, resume: bool) -> FolderSink | VideoSink:
-    """Return the sink of the pictures of an overlay at a path."""
-    if not path.parent.is_dir():
-        raise SessionError(f"--overlay {path}: there is no folder {path.parent}")
-    suffix = path.suffix.casefold()
-    if path.is_dir() or not suffix:
-        return FolderSink(path, resume=resume)
-    if suffix not in CODECS:
-        raise SessionError(
-            f"--overlay {path}: found the extension {suffix}, allowed are {', '.join(CODECS)} for "
-            "a video, and a name without one for a folder of pictures"
-        )
-    if resume:
-        raise SessionError(
-            f"--overlay {path}: --resume cannot go on in a video; name a folder, which gets a "
-            "picture per frame"
-        )
-    return VideoSink(path)
 
 
 class FolderSink:

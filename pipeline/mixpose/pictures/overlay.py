@@ -14,7 +14,7 @@ from mixpose.objective import pose_jacobian
 from mixpose.pictures import canvas
 from mixpose.pictures.canvas import GREY, WHITE, Colour, Picture
 from mixpose.records import Floats, Mask, Status
-from mixpose.rigid import transform
+from mixpose.rigid import CHI2_95, transform
 from mixpose.sensors import Sensor, facing
 
 STATUS_COLOURS: dict[Status, Colour] = {
@@ -34,8 +34,6 @@ BODY_COLOURS: tuple[Colour, ...] = (
     *((230, 230, 90), (150, 120, 255), (120, 200, 140), (255, 120, 190)),
 )
 """Colours of several bodies, in turn."""
-
-CHI2_95 = {1: 3.841, 2: 5.991}  # 95 % quantiles of χ² by degrees of freedom
 
 _AXIS_SHARE = 0.5  # of the body's radius
 _AXIS_PIECES = 24  # per axis, as lenses bend it

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.errors import SessionError
 from mixpose.fit import EstimatorOptions, free_mask
 from mixpose.objective import View, build_objective, matched_objective, pose_jacobian
 from mixpose.pictures.canvas import Picture
@@ -38,16 +37,6 @@ _MAPS = 3
 _BATCH = 512  # poses that are projected at once
 _APART = 0.01  # of a plot's width: least distance between names of features
 _SAMPLES = 200  # at most, per feature: enough for a plot
-
-
-def require_matplotlib() -> None:
-    """Raise a `SessionError` if matplotlib is not installed."""
-    try:
-        import matplotlib.figure  # noqa: F401, PLC0415
-    except ImportError as error:
-        raise SessionError(
-            "inspect: plots need matplotlib, which is not installed; pip install 'mixpose[plots]'"
-        ) from error
 
 
 def ranges_picture(
@@ -161,19 +150,17 @@ def _plot_ranges(
             look: dict[str, Any] = {"color": str(shade), "alpha": 0.45, "lw": 0}
             label = f"g / {top:.2g}, σ = {sigma:.2g}"
             axes.fill_between(ranges, values / top, label=label, **look)
-        _plot_matched(axes, finding.view, body, blurs[-1], np.linspace(low, high, _PLACES))
+        # C is g blurred once more, as the matched objective looks it up
+        sigma, ranges = blurs[-1], np.linspace(low, high, _PLACES)
+        places = np.stack([ranges, np.zeros_like(ranges)], axis=-1)[None, None]
+        atlas = matched_objective([finding.view], body, [sigma]).atlas
+        values = np.ravel(atlas.look_up(places)[..., 0])
+        top = max(float(values.max()), 1e-30)
+        label = f"C / {top:.2g}, σ = {sigma:.2g}"
+        axes.plot(ranges, values / top, color="black", lw=0.8, ls="--", label=label)
     _plot_expected(axes, finding, body, estimate)
     axes.set_xlim(low, high)
     axes.legend(fontsize=7, loc="upper right")
-
-
-def _plot_matched(axes: Axes, view: View, body: Body, sigma: float, ranges: Floats) -> None:
-    """Plot C, which is g blurred once more, as the matched objective looks it up."""
-    places = np.stack([ranges, np.zeros_like(ranges)], axis=-1)
-    values = matched_objective([view], body, [sigma]).atlas.look_up(places[None, None])[..., 0]
-    top = max(float(values.max()), 1e-30)
-    label = f"C / {top:.2g}, σ = {sigma:.2g}"
-    axes.plot(ranges, np.ravel(values) / top, color="black", lw=0.8, ls="--", label=label)
 
 
 def _plot_expected(axes: Axes, finding: Finding, body: Body, estimate: Estimate) -> None:

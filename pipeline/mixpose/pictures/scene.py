@@ -27,6 +27,7 @@ from mixpose.records import (
     PointPattern,
     RawFrame,
 )
+from mixpose.rigid import CHI2_95
 from mixpose.sensors import Sensor
 from mixpose.session import SensorSetup, Session
 
@@ -297,7 +298,7 @@ def half_widths_95(
     if covariance is None or not np.isfinite(covariance).all():
         return np.zeros(len(body))
     variances = overlay.projected_covariances(sensor, body, T_world_object, covariance)[:, 0, 0]
-    return np.asarray(np.sqrt(overlay.CHI2_95[1] * np.maximum(variances, 0)))
+    return np.asarray(np.sqrt(CHI2_95[1] * np.maximum(variances, 0)))
 
 
 def _span(

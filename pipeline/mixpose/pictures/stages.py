@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, TypeAlias
 
 import cv2
@@ -19,13 +18,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mixpose.body import Body
-from mixpose.density import Atlas
 from mixpose.extraction.corners import CORNERS, saddle_strength
 from mixpose.extraction.laplacian import spot_strength
 from mixpose.extraction.threshold import feature_values
 from mixpose.fit import EstimatorOptions
 from mixpose.objective import View, matched_objective, region_of_interest
-from mixpose.objective.paper import SampledTerm, sampled_terms
+from mixpose.objective.paper import sampled_terms
 from mixpose.pictures import canvas, overlay
 from mixpose.pictures.canvas import WHITE, Colour, Picture, Size
 from mixpose.pictures.finding import Finding
@@ -243,34 +241,27 @@ def panels_of(
     shown = lower, lower + np.array(size) / part.zoom + 2.0
     pattern = view.observation.pattern
     points = pattern.points if isinstance(pattern, PointPattern) else np.zeros((0, 2))
-    g_panels, matched_panels = [], []
-    density_at: DensityAt
-    for sigma in sigmas:
+
+    def panel(what: str, sigma: float, density_at: DensityAt) -> Panel:
+        values = _largest(density_at, sigma, points, part, size)
+        return Panel(f"{what}, σ = {sigma:.3g} px", values)
+
+    def g_panel(sigma: float) -> Panel:
         if is_matched or T is None:
             # exact sums, on a grid
-            word, density_at = "g", view.observation.density(sigma, shown).sample
-        else:
-            # as in objectives that draw samples: around these, 0 elsewhere
-            samples = body.sample(options.samples, seed=options.seed)
-            terms = sampled_terms([view], samples, [sigma], T)
-            word, density_at = "g sampled", partial(_sampled, terms)
-        values = _largest(density_at, sigma, points, part, size)
-        g_panels.append(Panel(f"{word}, σ = {sigma:.3g} px", values))
-    for sigma in matched_sigmas:
-        density_at = partial(_looked_up, matched_objective([view], body, [sigma]).atlas)
-        title = f"C = g ∗ ε, σ = {sigma:.3g} px"
-        matched_panels.append(Panel(title, _largest(density_at, sigma, points, part, size)))
-    return [g_panels, matched_panels]
+            return panel("g", sigma, view.observation.density(sigma, shown).sample)
+        # as in objectives that draw samples: around these, 0 elsewhere
+        samples = body.sample(options.samples, seed=options.seed)
+        terms = sampled_terms([view], samples, [sigma], T)
+        if not terms:
+            return panel("g sampled", sigma, lambda places: np.zeros(places.shape[:-1]))
+        return panel("g sampled", sigma, lambda places: terms[0].density.sample(places)[..., 0])
 
+    def matched_panel(sigma: float) -> Panel:
+        atlas = matched_objective([view], body, [sigma]).atlas
+        return panel("C = g ∗ ε", sigma, lambda places: atlas.look_up(places[None])[0, ..., 0])
 
-def _sampled(terms: Sequence[SampledTerm], places: Floats) -> NDArray[Any]:
-    """Look up the density of the first term at places; 0 without terms."""
-    return terms[0].density.sample(places)[..., 0] if terms else np.zeros(places.shape[:-1])
-
-
-def _looked_up(atlas: Atlas, places: Floats) -> NDArray[Any]:
-    """Look up the density of the only view in an atlas at places."""
-    return atlas.look_up(places[None])[0, ..., 0]
+    return [[*map(g_panel, sigmas)], [*map(matched_panel, matched_sigmas)]]
 
 
 def _largest(density_at: DensityAt, sigma: float, points: Floats, part: Part, size: Size) -> Floats:

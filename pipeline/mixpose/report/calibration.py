@@ -10,7 +10,7 @@ from mixpose.calibration import Calibration
 from mixpose.calibration.result import residuals_by
 from mixpose.calibration.rig import centre_of
 from mixpose.calibration.telling import lines_of
-from mixpose.report.figures import BARS, POSE, TRUTH, Chart, blank, svg_of
+from mixpose.report.figures import POSE, TRUTH, Chart, blank, svg_of
 from mixpose.report.page import page_templates
 
 MARK = '<meta name="generator" content="mixpose calibration'
@@ -75,7 +75,7 @@ def _rig_chart(calibration: Calibration, unit: str) -> Chart:
     everything = np.concatenate([after, body])
     a, b = np.sort(np.argsort(-np.ptp(everything, axis=0), kind="stable")[:2])
     figure, axes = blank(height=3.6)
-    axes.plot(body[:, a], body[:, b], ".", markersize=3, **BARS)
+    axes.plot(body[:, a], body[:, b], ".", markersize=3, **POSE)
     axes.plot(before[:, a], before[:, b], **{**TRUTH, "linestyle": "none", "marker": "x"})
     axes.plot(after[:, a], after[:, b], "o", markersize=5, fillstyle="none", **POSE)
     axes.set_aspect("equal", adjustable="datalim")
@@ -94,7 +94,7 @@ def _residuals(calibration: Calibration, kind: Literal["frame", "feature"]) -> C
     else:
         labels = [calibration.after.body.labels[k] for k in numbers]
         numbers = numbers + 1
-        axes.bar(numbers, values, **BARS)
+        axes.bar(numbers, values, **POSE)
         if len(numbers) <= _MOST_NAMED:
             axes.set_xticks(numbers, labels, parse_math=False)
         axes.set_xlabel("feature of the body")

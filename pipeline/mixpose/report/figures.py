@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 _BLUE, _ORANGE, _RED, _GREY = "#2f80d0", "#d9780f", "#dc4450", "#8a8f98"
 
 POSE: dict[str, Any] = {"color": _BLUE}
-BARS: dict[str, Any] = {"color": _BLUE}
 TRUTH: dict[str, Any] = {"color": _GREY, "linestyle": (0, (3, 1.5)), "linewidth": 1.1, "marker": ""}
 BAND: dict[str, Any] = {"color": _BLUE, "linewidth": 0.9, "markersize": 1.5}
 _AMBIGUOUS: dict[str, Any] = {"linestyle": "none", "marker": "D", "color": _ORANGE, "zorder": 4}
@@ -263,7 +262,7 @@ def latency(series: Series) -> list[Chart]:
     low, high = (low / 1.5, high * 1.5) if high < 1.5 * low else (low, high)
     edges = np.geomspace(low, high, min(_BINS, 8 + len(known) // 4) + 1)
     figure, axes = blank()
-    axes.hist(known, bins=np.clip(edges, low, high).tolist(), **BARS)
+    axes.hist(known, bins=np.clip(edges, low, high).tolist(), **POSE)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
     axes.set_xscale("log")
     # ticks as people write numbers

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -125,10 +125,10 @@ def _body_content(
     has_poses = bool(np.any(series.status != "lost"))
     return {
         "series": series,
-        "notices": _notices(poses, series, cut),
+        "notices": list(_notices(poses, series, cut)),
         "counts": [(status, int(np.sum(series.status == status))) for status in _STATUSES],
         "ranges": [(status, _ranges_text(series, status)) for status in _STATUSES[1:]],
-        "numbers": _numbers(series, evaluation),
+        "numbers": list(_numbers(series, evaluation)),
         "evaluation": evaluation,
         "sensor_rows": _sensor_rows(poses, series, origin, unit_of),
         "error_charts": [] if errors is None else figures.errors_over_time(series, errors),
@@ -160,24 +160,20 @@ def _facts(poses: PoseFile, labels: Sequence[str]) -> list[tuple[str, str]]:
     return [(name, str(value)) for name, value in facts.items() if value is not None]
 
 
-def _notices(poses: PoseFile, series: Series, cut: bool) -> list[str]:
-    notices = []
+def _notices(poses: PoseFile, series: Series, cut: bool) -> Iterator[str]:
     if cut:
-        notices.append(
+        yield (
             "The last line of the poses file is cut off: the run is not finished, or was "
             "interrupted. This report is about the frames before it."
         )
     if not poses.header:
-        notices.append(
-            "The poses file has no header, so unit, session and symmetries are not known."
-        )
+        yield "The poses file has no header, so unit, session and symmetries are not known."
     elif poses.unit is None:
-        notices.append("The header of the poses file states no unit of length.")
+        yield "The header of the poses file states no unit of length."
     if not series.frames:
-        notices.append("The poses file holds no frame.")
+        yield "The poses file holds no frame."
     elif np.all(series.status == "lost"):
-        notices.append("Every frame is lost, so there is no pose to draw.")
-    return notices
+        yield "Every frame is lost, so there is no pose to draw."
 
 
 def _ranges_text(series: Series, status: Status) -> str:
@@ -187,15 +183,15 @@ def _ranges_text(series: Series, status: Status) -> str:
     return ", ".join(words[:_MOST_RANGES]) + (f" and {more} more stretches" if more > 0 else "")
 
 
-def _numbers(series: Series, evaluation: Evaluation | None) -> list[Figure]:
-    figures = [Figure("frames", str(len(series.frames)), _span(series))]
+def _numbers(series: Series, evaluation: Evaluation | None) -> Iterator[Figure]:
+    yield Figure("frames", str(len(series.frames)), _span(series))
     if evaluation is not None and evaluation.rotation_deg and evaluation.translation:
         for name, errors, unit in (
             ("rotation error, RMS", evaluation.rotation_deg, "°"),
             ("position error, RMS", evaluation.translation, f" {series.unit}"),
         ):
             most = f"at most {_short(errors.max)}{unit}"
-            figures.append(Figure(name, f"{_short(errors.rms)}{unit}", most))
+            yield Figure(name, f"{_short(errors.rms)}{unit}", most)
     for name, widths, unit in (
         ("position, 95 %", series.half_width[:, :3], f" {series.unit}"),
         ("turn, 95 %", series.half_width[:, 3:], "°"),
@@ -205,15 +201,14 @@ def _numbers(series: Series, evaluation: Evaluation | None) -> list[Figure]:
             middle, count = float(np.nanmedian(widest)), int(np.isinf(widest).sum())
             value = "open" if np.isinf(middle) else f"± {_short(middle)}{unit}"
             note = f"; open in {count} frames" if count else ""
-            figures.append(Figure(name, value, f"median of the least certain axis{note}"))
+            yield Figure(name, value, f"median of the least certain axis{note}")
     posed = series.score[[status != "lost" for status in series.status]]
     if np.isfinite(posed).any():
-        figures.append(Figure("score", _median(posed), "median of frames with a pose; 1 is best"))
+        yield Figure("score", _median(posed), "median of frames with a pose; 1 is best")
     if np.isfinite(series.latency_ms).any():
         slow = float(np.nanpercentile(series.latency_ms, 95))
         value = f"{_median(series.latency_ms)} ms"
-        figures.append(Figure("per frame", value, f"median; 95 % within {_short(slow)} ms"))
-    return figures
+        yield Figure("per frame", value, f"median; 95 % within {_short(slow)} ms")
 
 
 def _span(series: Series) -> str:
@@ -264,7 +259,6 @@ def _short(value: float) -> str:
 class Origin:
     """What is known of the session file of a run."""
 
-    named: str | None = None  # path in the header of the poses
     path: Path | None = None  # of the file that was read
     text: str | None = None  # its text
     notice: str | None = None  # problem: missing, changed, no longer a session
@@ -287,14 +281,14 @@ def find_session(poses: PoseFile) -> Origin:
         if (content := _bytes_of(path)) is not None
     ]
     if not candidates:
-        return Origin(named, notice=f"The session file {named} is missing or cannot be read.")
+        return Origin(notice=f"The session file {named} is missing or cannot be read.")
     for path, content in candidates:
         if hashlib.sha256(content).hexdigest() == wanted:
             text = content.decode("utf-8-sig", errors="replace")
             try:
-                return Origin(named, path, text, session=load_session(path))
+                return Origin(path, text, session=load_session(path))
             except SessionError as error:
-                return Origin(named, path, text, f"The session cannot be read again: {error}")
+                return Origin(path, text, f"The session cannot be read again: {error}")
     path, content = candidates[0]
     notice = f"The poses file states no SHA-256, so {path} may have changed since the run."
     if isinstance(wanted, str):
@@ -302,8 +296,8 @@ def find_session(poses: PoseFile) -> Origin:
     try:
         load_session(path)
     except SessionError:
-        return Origin(named, path, notice=f"{notice} It is no session file now and is not shown.")
-    return Origin(named, path, content.decode("utf-8-sig", errors="replace"), notice)
+        return Origin(path, notice=f"{notice} It is no session file now and is not shown.")
+    return Origin(path, content.decode("utf-8-sig", errors="replace"), notice)
 
 
 def _bytes_of(path: Path) -> bytes | None:

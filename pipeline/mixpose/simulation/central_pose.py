@@ -203,23 +203,21 @@ def _pose_apart(
     rng = generator(seed, Purpose.ORIENTATION)
     largest = max([body.radius, *(radius for _, radius in placed)])
     for distance in _DISTANCES:
-        best: tuple[int, Floats] | None = None
+        most, best = -1, T
         for _ in range(_TRIES):
             direction = rng.standard_normal(3)
             shift = distance * largest * direction / np.linalg.norm(direction)
             middle = placed[0][0] + shift
             R = rotation_matrix(rng.standard_normal(3)) @ T[:3, :3] if turned else T[:3, :3]
-            if any(
-                np.linalg.norm(middle - other) < _APART * (body.radius + radius)
-                for other, radius in placed
-            ):
+            near = [np.linalg.norm(middle - m) < _APART * (body.radius + r) for m, r in placed]
+            if any(near):
                 continue
             T_candidate = from_parts(R, middle - R @ pivot_of(body))
             seen = count_seen(session, T_candidate)
-            if best is None or seen > best[0]:
-                best = seen, T_candidate
-        if best is not None and best[0] == len(body) * len(session.sensors):
-            return best[1]
+            if seen > most:
+                most, best = seen, T_candidate
+        if most == len(body) * len(session.sensors):
+            return best
     raise SessionError(
         f"{session.path}: object {body.name!r}: found no place apart from the other bodies in view "
         "of all cameras; give it an [object.start]"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import partial
 from math import ceil
 from pathlib import Path
 
@@ -17,7 +19,6 @@ from mixpose.simulation import render
 from mixpose.simulation.motion import Motion, Shutter
 from mixpose.simulation.naming import SourceFiles
 from mixpose.simulation.options import Output, Purpose, SimulationOptions, generator
-from mixpose.simulation.render import DetectionWriter, ProfileWriter, SensorWriter
 from mixpose.simulation.scenery import Scenery
 from mixpose.simulation.visible_spots import View, brightness_levels
 
@@ -39,7 +40,7 @@ class Channel:
     files: SourceFiles
     view: View
     options: SimulationOptions  # that hold for this sensor
-    open: Callable[[Path], SensorWriter]  # opens the writer in the recording's folder
+    writing: Callable[[Path], AbstractContextManager[render.Write]]  # in the recording's folder
     step_s: float = 0.0  # seconds after the first sensor, as in its table of times
 
 
@@ -74,17 +75,12 @@ class Planner:
         Random numbers are keyed by its `index` in the session; it is `step_s` later than the first
         sensor, and so are its times.
         """
-        shutter = shutter_of(setup, self.options, step_s)
-        is_image = setup.sensor.dimension == 2
-        is_profile = setup.range_min is not None and setup.bin_size is not None
-        if files.kind == "detections" or (setup.sensor.dimension == 1 and not is_profile):
+        shutter, is_image = shutter_of(setup, self.options, step_s), setup.sensor.dimension == 2
+        if files.kind == "detections":
             channel = self._table(setup, files)
-            if is_image:  # a detection is the middle of a streak
-                shutter = replace(shutter, exposure_s=0.0)
-        elif is_image:
-            channel = self._camera(setup, files, index)
+            shutter = replace(shutter, exposure_s=0.0)  # a detection is the middle of a streak
         else:
-            channel = self._profiles(setup, files, index)
+            channel = (self._camera if is_image else self._profiles)(setup, files, index)
         scenery = self.scenery if is_image else Scenery()
         view = replace(channel.view, shutter=shutter, scenery=scenery)
         return replace(channel, view=view, step_s=step_s)
@@ -95,15 +91,12 @@ class Planner:
         optics = _SPOT_SIGMA_PX if self.body.radii is None else _OPTICS_PX
         spot_sigma = options.spot_sigma or setup.extract.spot_sigma or optics
         form = render.ImageFormat(setup.resolution, spot_sigma, setup.extract.polarity)
-
-        def start(folder: Path) -> SensorWriter:
-            if files.kind == "images":
-                return render.ImageWriter(files, folder, options, form)
-            return render.VideoWriter(files, folder, options, form, self.fps)
-
+        writing = partial(render.image_writer, files, options, form)
+        if files.kind == "video":
+            writing = partial(render.video_writer, files, options, form, self.fps)
         bounds = setup.sensor.lower, setup.sensor.upper
         view = self._view(setup, bounds, spot_sigma, index)
-        return Channel("images", files, view, options, start)
+        return Channel("images", files, view, options, writing)
 
     def _profiles(self, setup: SensorSetup, files: SourceFiles, index: int) -> Channel:
         options, range_min, bin_size = self.options, setup.range_min, setup.bin_size
@@ -119,9 +112,8 @@ class Planner:
             )
         form = render.ProfileFormat(bins, range_min, bin_size, width)
         view = self._view(setup, (np.maximum(nearest, range_min), farthest), width, index)
-        return Channel(
-            "profiles", files, view, options, lambda at: ProfileWriter(files, at, options, form)
-        )
+        writing = partial(render.profile_writer, files, options, form)
+        return Channel("profiles", files, view, options, writing)
 
     def _table(self, setup: SensorSetup, files: SourceFiles) -> Channel:
         sensor, sigma, options = setup.sensor, setup.extract.sigma, self.options
@@ -134,14 +126,10 @@ class Planner:
             usual = sigma if sensor.dimension == 1 else _CLOUD_NOISE * sigma
             noise = usual if options.range_noise is None else options.range_noise
         view = View(sensor, *bounds, np.ones(len(self.body)), spacing)
-        coordinates = _COORDINATES[sensor.dimension]
-        return Channel(
-            "pixels" if sensor.dimension == 2 else "lengths",
-            files,
-            view,
-            replace(options, brightness_spread=0.0),
-            lambda folder: DetectionWriter(files, folder, noise=noise, coordinates=coordinates),
-        )
+        output: Output = "pixels" if sensor.dimension == 2 else "lengths"
+        even = replace(options, brightness_spread=0.0)
+        writing = partial(render.detection_writer, files, noise, _COORDINATES[sensor.dimension])
+        return Channel(output, files, view, even, writing)
 
     def _view(
         self, setup: SensorSetup, bounds: tuple[Floats, Floats], sigma: float, index: int

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -21,7 +21,7 @@ from mixpose.simulation.channels import Channel, Planner, check_setup
 from mixpose.simulation.motion import Motion
 from mixpose.simulation.naming import plan_files
 from mixpose.simulation.options import DEFAULT_FPS, Purpose, SimulationOptions, generator
-from mixpose.simulation.render import SensorWriter
+from mixpose.simulation.render import Write
 from mixpose.simulation.scenery import Actor, plan_scenery
 from mixpose.simulation.session_copy import SESSION_NAME, SessionCopy, copy_session
 from mixpose.simulation.visible_spots import VisibleSpots, displacements, look, shifted
@@ -189,7 +189,7 @@ def _record(plan: _Plan, folder: Path, progress: Progress | None) -> None:
     names = [(entry.body.name, i) for entry in plan.session.objects for i in entry.instances]
     paths = [plan.motion.pose, *(companion.pose for companion in plan.companions)]
     with ExitStack() as stack:
-        writers = [stack.enter_context(closing(c.open(folder))) for c in plan.channels]
+        writers = [stack.enter_context(c.writing(folder)) for c in plan.channels]
         truth = stack.enter_context((folder / TRUTH_NAME).open("w", encoding="ascii", newline="\n"))
         truth.write(_line(_header(plan)))
         for done, number in enumerate(plan.numbers, start=1):
@@ -213,7 +213,7 @@ def _record(plan: _Plan, folder: Path, progress: Progress | None) -> None:
 
 
 def _record_frame(
-    plan: _Plan, writers: Iterable[SensorWriter], number: int, T_world_object: Floats, moment: float
+    plan: _Plan, writers: Iterable[Write], number: int, T_world_object: Floats, moment: float
 ) -> bool:
     """Record one frame with every sensor; return False if none has it or the body is away."""
     options, body = plan.options, plan.session.body
@@ -224,26 +224,19 @@ def _record_frame(
         rng = generator(options.seed, Purpose.DEFORMATION, number)
         offsets = displacements(body, T_world_object, rng)
     recorded = False
-    for i, (channel, writer) in enumerate(zip(plan.channels, writers)):
+    for i, (channel, write) in enumerate(zip(plan.channels, writers)):
         chance = generator(options.seed, Purpose.MISSING, number, i).random()
         is_missing = chance < options.missing
         if is_missing and channel.files.may_lack_frames:
             continue
         rng = generator(options.seed, Purpose.FRAME, number, i)
-        visible = look(
-            channel.view,
-            body,
-            T_world_object,
-            channel.options,
-            rng,
-            offsets=offsets,
-            pose_after=None if channel.view.shutter.is_ideal else shifted(plan.motion.pose, moment),
-            time_s=moment,
-            is_away=is_away,
-        )
+        view = channel.view
+        later = None if view.shutter.is_ideal else shifted(plan.motion.pose, moment)
+        seen = view, body, T_world_object, channel.options, rng
+        visible = look(*seen, offsets=offsets, pose_after=later, time_s=moment, is_away=is_away)
         if is_missing:
             visible = VisibleSpots(visible.points[:0], visible.levels[:0], visible.features[:0])
-        writer.write(number, number / plan.fps + channel.step_s, visible, rng)
+        write(number, number / plan.fps + channel.step_s, visible, rng)
         recorded = True
     return recorded and not is_away
 

@@ -6,6 +6,8 @@ the feature, without a bias toward pixel centres.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
@@ -168,128 +170,106 @@ def _with_folder(path: Path) -> Path:
     return path
 
 
-@dataclass(frozen=True)
-class ImageWriter:
-    """Writer of a file per image."""
+Write: TypeAlias = Callable[[int, float, VisibleSpots, Generator], None]
+"""Function that writes a sensor's frame, by its number, time in s, spots and random numbers.
 
-    files: SourceFiles
-    folder: Path
-    options: SimulationOptions
-    form: ImageFormat
+Numbers ascend.
+"""
 
-    def write(self, number: int, time_s: float, visible: VisibleSpots, rng: Generator) -> None:
-        """Draw and write one image."""
-        image = render_image(visible, self.form, self.options, rng)
-        path = _with_folder(self.folder / self.files.name(number))
+
+@contextmanager
+def image_writer(
+    files: SourceFiles, options: SimulationOptions, form: ImageFormat, folder: Path
+) -> Iterator[Write]:
+    """Write a file per image."""
+
+    def write(number: int, time_s: float, visible: VisibleSpots, rng: Generator) -> None:
+        image = render_image(visible, form, options, rng)
+        path = _with_folder(folder / files.name(number))
         suffix = path.suffix.casefold()
         path.write_bytes(cv2.imencode(suffix, image, _PNG if suffix == ".png" else ())[1].tobytes())
 
-    def close(self) -> None:
-        """Do nothing: each image is complete when it is written."""
+    yield write
 
 
-class VideoWriter:
-    """Writer of all images into one video: MJPEG in .avi, MPEG-4 in .mp4."""
-
-    def __init__(
-        self,
-        files: SourceFiles,
-        folder: Path,
-        options: SimulationOptions,
-        form: ImageFormat,
-        fps: float,
-    ) -> None:
-        self._options, self._form = options, form
-        path = _with_folder(folder / files.path)
-        # the quality of OpenCV's own MJPEG writer can be set
-        is_mjpeg = path.suffix.casefold() == ".avi"
-        self._video = cv2.VideoWriter(
-            str(path),
-            cv2.CAP_OPENCV_MJPEG if is_mjpeg else cv2.CAP_FFMPEG,
-            cv2.VideoWriter.fourcc(*("MJPG" if is_mjpeg else "mp4v")),
-            fps,
-            form.resolution,
-            (cv2.VIDEOWRITER_PROP_QUALITY, _VIDEO_QUALITY) if is_mjpeg else (),
+@contextmanager
+def video_writer(
+    files: SourceFiles, options: SimulationOptions, form: ImageFormat, fps: float, folder: Path
+) -> Iterator[Write]:
+    """Write all images into one video: MJPEG in .avi, MPEG-4 in .mp4."""
+    path = _with_folder(folder / files.path)
+    # the quality of OpenCV's own MJPEG writer can be set
+    is_mjpeg = path.suffix.casefold() == ".avi"
+    video = cv2.VideoWriter(
+        str(path),
+        cv2.CAP_OPENCV_MJPEG if is_mjpeg else cv2.CAP_FFMPEG,
+        cv2.VideoWriter.fourcc(*("MJPG" if is_mjpeg else "mp4v")),
+        fps,
+        form.resolution,
+        (cv2.VIDEOWRITER_PROP_QUALITY, _VIDEO_QUALITY) if is_mjpeg else (),
+    )
+    if not video.isOpened():
+        raise SessionError(
+            f"simulate: sensor {files.sensor!r}: source: {files.path} cannot be written as a "
+            'video; write images, with a glob like "left*.png"'
         )
-        if not self._video.isOpened():
-            raise SessionError(
-                f"simulate: sensor {files.sensor!r}: source: {files.path} cannot be written as a "
-                'video; write images, with a glob like "left*.png"'
-            )
 
-    def write(self, number: int, time_s: float, visible: VisibleSpots, rng: Generator) -> None:
-        """Draw one image and append it."""
-        image = render_image(visible, self._form, self._options, rng)
-        self._video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    def write(number: int, time_s: float, visible: VisibleSpots, rng: Generator) -> None:
+        image = render_image(visible, form, options, rng)
+        video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
 
-    def close(self) -> None:
-        """Finish the container."""
-        self._video.release()
+    try:
+        yield write
+    finally:
+        video.release()
 
 
-class _TableWriter:
-    """Writer of rows into one file."""
-
-    def __init__(self, files: SourceFiles, folder: Path) -> None:
-        self._path = _with_folder(folder / files.path)
-        self._file = self._path.open("wb")
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-
-class ProfileWriter(_TableWriter):
-    """Writer of a row per frame: .npy of float32, or .csv without a header."""
-
-    def __init__(
-        self, files: SourceFiles, folder: Path, options: SimulationOptions, form: ProfileFormat
-    ) -> None:
-        super().__init__(files, folder)
-        self._options, self._form = options, form
-        self._is_text = self._path.suffix.casefold() == ".csv"
-        if not self._is_text:
+@contextmanager
+def profile_writer(
+    files: SourceFiles, options: SimulationOptions, form: ProfileFormat, folder: Path
+) -> Iterator[Write]:
+    """Write a row per frame: .npy of float32, or .csv without a header."""
+    path = _with_folder(folder / files.path)
+    is_text = path.suffix.casefold() == ".csv"
+    with path.open("wb") as file:
+        if not is_text:
             shape = (options.frames, form.bins)
             header = {"descr": "<f4", "fortran_order": False, "shape": shape}
-            np.lib.format.write_array_header_1_0(self._file, header)
+            np.lib.format.write_array_header_1_0(file, header)
 
-    def write(self, number: int, time_s: float, visible: VisibleSpots, rng: Generator) -> None:
-        """Draw one profile and append it."""
-        profile = render_profile(visible, self._form, self._options, rng)
-        row = profile.astype("<f4").tobytes()
-        if self._is_text:
-            row = (",".join(f"{value:.6g}" for value in profile.tolist()) + "\n").encode("ascii")
-        self._file.write(row)
+        def write(number: int, time_s: float, visible: VisibleSpots, rng: Generator) -> None:
+            profile = render_profile(visible, form, options, rng)
+            row = profile.astype("<f4").tobytes()
+            if is_text:
+                row = (",".join(f"{value:.6g}" for value in profile.tolist()) + "\n").encode(
+                    "ascii"
+                )
+            file.write(row)
 
-
-class DetectionWriter(_TableWriter):
-    """Writer of a row per detection, shuffled, or one of weight 0 for a frame without any."""
-
-    def __init__(
-        self, files: SourceFiles, folder: Path, *, noise: float, coordinates: tuple[str, ...]
-    ) -> None:
-        super().__init__(files, folder)
-        self._noise, self._coordinates = noise, coordinates
-        self._append("frame", "time_s", *coordinates, "weight")
-
-    def _append(self, *cells: str) -> None:
-        self._file.write((",".join(cells) + "\n").encode("ascii"))
-
-    def write(self, number: int, time_s: float, visible: VisibleSpots, rng: Generator) -> None:
-        """Append the detections of one frame."""
-        noise = self._noise * rng.standard_normal(visible.points.shape)
-        is_shown = np.ones(len(noise), dtype=bool)
-        for occluder in visible.occluders:
-            corners = occluder.astype(np.float32)
-            inside = [cv2.pointPolygonTest(corners, y.tolist(), False) for y in visible.points]
-            is_shown &= np.array(inside, dtype=float) < 0
-        points, weights = (visible.points + noise)[is_shown], visible.levels[is_shown]
-        if not len(points):
-            points, weights = np.zeros((1, len(self._coordinates))), np.zeros(1)
-        for i in rng.permutation(len(points)):
-            cells = [f"{value:.9g}" for value in (*points[i], weights[i])]
-            self._append(str(number), f"{time_s:.6f}", *cells)
+        yield write
 
 
-SensorWriter: TypeAlias = ImageWriter | VideoWriter | ProfileWriter | DetectionWriter
-"""Writer of the frames of one sensor, by ascending numbers, until it is closed."""
+@contextmanager
+def detection_writer(
+    files: SourceFiles, noise: float, coordinates: tuple[str, ...], folder: Path
+) -> Iterator[Write]:
+    """Write a row per detection, shuffled, or one of weight 0 for a frame without any."""
+    path = _with_folder(folder / files.path)
+    with path.open("w", encoding="ascii", newline="\n") as file:
+        file.write(",".join(("frame", "time_s", *coordinates, "weight")) + "\n")
+
+        def write(number: int, time_s: float, visible: VisibleSpots, rng: Generator) -> None:
+            errors = noise * rng.standard_normal(visible.points.shape)
+            is_shown = np.ones(len(errors), dtype=bool)
+            for occluder in visible.occluders:
+                corners = occluder.astype(np.float32)
+                inside = [cv2.pointPolygonTest(corners, y.tolist(), False) for y in visible.points]
+                is_shown &= np.array(inside, dtype=float) < 0
+            points, weights = (visible.points + errors)[is_shown], visible.levels[is_shown]
+            if not len(points):
+                points, weights = np.zeros((1, len(coordinates))), np.zeros(1)
+            for i in rng.permutation(len(points)):
+                cells = ",".join(f"{value:.9g}" for value in (*points[i], weights[i]))
+                file.write(f"{number},{time_s:.6f},{cells}\n")
+
+        yield write

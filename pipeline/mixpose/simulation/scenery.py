@@ -44,6 +44,10 @@ class Actor:
     is_body_image: bool = False  # a mirror image of the body, which is away when the body is
     is_body: bool = False  # a body of the session: solid, some features hidden by chance
 
+    def seen_at(self, T_world_object: Floats) -> Floats:
+        """Return the motion (4, 4) from the object to where it is seen, perhaps in a mirror."""
+        return T_world_object if self.mirror is None else self.mirror @ T_world_object
+
 
 @dataclass(frozen=True)
 class Arm:
@@ -160,10 +164,6 @@ class _Stage:
         swing = np.array([-np.sin(angle), np.cos(angle), 0.0]) @ self.frame
         centre = self.centre + _ARM_BEFORE * radius * self.frame[2]
         reach = 0.5 * _ARM_LENGTH * radius * along
-        return Arm(
-            np.array([centre - reach, centre + reach]),
-            _ARM_SWING * radius * swing,
-            _ARM_PERIOD * self.options.period_s,
-            self.rng.uniform(0, 2 * np.pi),
-            _ARM_WIDTH * radius,
-        )
+        ends, phase = np.array([centre - reach, centre + reach]), self.rng.uniform(0, 2 * np.pi)
+        period_s = _ARM_PERIOD * self.options.period_s
+        return Arm(ends, _ARM_SWING * radius * swing, period_s, phase, _ARM_WIDTH * radius)

@@ -68,12 +68,9 @@ def copy_session(session: Session) -> SessionCopy:
         content = str(tomlkit.dumps(document)).encode()
     sources = [sensor.get("source", "") for sensor in document.unwrap()["sensor"]]
     sources = [f"camera:{s}" if isinstance(s, int) else s for s in sources]
-    return SessionCopy(
-        content=content,
-        sources=tuple(tuple(s) if isinstance(s, list) else s for s in sources),
-        times=times,
-        files=tuple((origin, name) for name, origin in files.items()),
-    )
+    listed = tuple(tuple(s) if isinstance(s, list) else s for s in sources)
+    origins = tuple((origin, name) for name, origin in files.items())
+    return SessionCopy(content, listed, times, origins)
 
 
 def _moved(session: Session, document: Any) -> dict[str, str]:

@@ -93,30 +93,30 @@ def look(
     least = int(options.clutter)
     false_count = least + int(rng.random() < options.clutter - least)
     clutter = rng.uniform(view.lowest, view.highest, (false_count, len(view.lowest)))
-    spots = _Spots([clutter], [brightness_levels(len(clutter), options.brightness_spread, rng)])
-    spots.owners += range(count, count + len(clutter))
+    levels = brightness_levels(false_count, options.brightness_spread, rng)
+    spots = _Spots(view, [clutter], [levels], list(range(count, count + false_count)))
     subject = Actor(body, pose_after or (lambda _: T_world_object), view.levels, is_body=True)
     actors = [subject, *view.scenery.actors]
     poses = [T_world_object, *(actor.pose(time_s) for actor in view.scenery.actors)]
-    means = [actor.body.means.mean(axis=0)[None] for actor in actors]
-    middles = [transform(T, mean)[0] for T, mean in zip(poses, means, strict=True)]
+    middles = [transform(T, a.body.means.mean(axis=0)[None])[0] for T, a in zip(poses, actors)]
     radii = [_CORE * actor.body.radius for actor in actors]
     if is_away:
         radii[0] = 0.0
     for actor, T in zip(actors, poses, strict=True):
-        seen = facing(view.sensor, actor.body, T, actor.mirror)
+        seen = facing(view.sensor, actor.body, actor.seen_at(T))
         if actor.is_body:
-            seen &= ~_hidden_by_chance(len(actor.body), options, rng)
+            seen &= rng.random(len(seen)) >= options.hidden
+            seen[rng.permutation(len(seen))[: options.hidden_count]] = False
             cores = zip(actors, middles, radii, strict=True)
             others = [(m, r) for other, m, r in cores if other.is_body and other is not actor]
             seen &= ~are_occluded(view.sensor, transform(T, actor.body.means), others)
         if is_away and (actor is subject or actor.is_body_image):
             continue
         pose_later = subject.pose if actor is subject else shifted(actor.pose, time_s)
-        first = 0 if actor is subject else count + len(clutter)
+        first = 0 if actor is subject else count + false_count
         for i in np.flatnonzero(seen).tolist():
             offset = offsets[i] if actor is subject and offsets is not None else np.zeros(3)
-            spots.add(view, actor, i, first + i, pose_later, offset)
+            spots.add(actor, i, first + i, pose_later, offset)
     seen_at_s = time_s + view.shutter.delay_s
     occluders = [arm.outline(view.unbounded, seen_at_s) for arm in view.scenery.arms]
     return spots.visible(tuple(corners for corners in occluders if len(corners)))
@@ -147,30 +147,25 @@ def shifted(pose: PoseAt, time_s: float) -> PoseAt:
 class _Spots:
     """All spots of one sensor in a frame, while they are collected."""
 
+    view: View
     points: list[Floats]
     levels: list[Floats]
-    owners: list[int] = field(default_factory=list)
+    owners: list[int]
     outlines: dict[int, Floats] = field(default_factory=dict)
 
     def add(
-        self,
-        view: View,
-        actor: Actor,
-        feature: int,
-        owner: int,
-        pose_after: PoseAt,
-        offset: Floats,
+        self, actor: Actor, feature: int, owner: int, pose_after: PoseAt, offset: Floats
     ) -> None:
         """Add the spots of one feature, at each moment of the exposure."""
-        body, mirror, sensor = actor.body, actor.mirror, view.sensor
+        view, body, sensor = self.view, actor.body, self.view.sensor
         has_size = sensor.dimension == 2 and body.radii is not None and body.radii[feature] > 0
         poses = view.shutter.poses(sensor, body.means[feature], pose_after)
         for pose in poses:
             T = pose.copy()
             T[:3, 3] += T[:3, :3] @ offset
-            edge = outline(view.unbounded, body, feature, T, mirror) if has_size else None
+            M = actor.seen_at(T)
+            edge = outline(view.unbounded, body, feature, M) if has_size else None
             if edge is None:
-                M = T if mirror is None else mirror @ T
                 y, shares = _spots(view, body.features[feature], M)
             else:
                 y, shares = centroid(edge)[None], np.ones(1)
@@ -188,12 +183,10 @@ class _Spots:
         return VisibleSpots(points, levels, owners, self.outlines, occluders)
 
 
-def facing(
-    sensor: Sensor, body: Body, T_world_object: Floats, mirror: Floats | None = None
-) -> Mask:
+def facing(sensor: Sensor, body: Body, T_world_object: Floats) -> Mask:
     """Test which features (N,) face a sensor; all of a body without normals."""
-    M = T_world_object if mirror is None else mirror @ T_world_object
-    return sensors.facing(sensor, M, transform(M, body.means), body.normals)
+    points = transform(T_world_object, body.means)
+    return sensors.facing(sensor, T_world_object, points, body.normals)
 
 
 def brightness_levels(count: int, spread: float, rng: Generator) -> Floats:
@@ -210,13 +203,6 @@ def displacements(body: Body, T_world_object: Floats, rng: Generator) -> Floats:
         return drawn
     along = body.gravity.sigma * rng.standard_normal((len(body), 1)) * body.gravity.unit
     return np.asarray(drawn + along @ T_world_object[:3, :3])
-
-
-def _hidden_by_chance(count: int, options: SimulationOptions, rng: Generator) -> Mask:
-    """Draw which features (N,) are hidden in this view."""
-    is_hidden = rng.random(count) < options.hidden
-    is_hidden[rng.permutation(count)[: options.hidden_count]] = True
-    return is_hidden
 
 
 def _spots(view: View, feature: Feature, T_world_object: Floats) -> tuple[Floats, Floats]:
@@ -238,17 +224,14 @@ def _spots(view: View, feature: Feature, T_world_object: Floats) -> tuple[Floats
     return y[visible], shares[visible]
 
 
-def outline(
-    sensor: Sensor, body: Body, feature: int, T_world_object: Floats, mirror: Floats | None = None
-) -> Floats | None:
+def outline(sensor: Sensor, body: Body, feature: int, M: Floats) -> Floats | None:
     """Return the outline (CORNERS, 2) of a sphere or disk, px; None if not all of it is in view.
 
-    `sensor` should have no bounds, as parts beyond an image have no projection in it.  `mirror`
-    (4, 4) is a reflection of the world in which the feature is seen.
+    `sensor` should have no bounds, as parts beyond an image have no projection in it.  M (4, 4) is
+    the pose T_world_object or, of a mirror image, its reflection.
     """
     assert body.radii is not None, "a body of points has no outlines"
     radius = float(body.radii[feature])
-    M = T_world_object if mirror is None else mirror @ T_world_object
     centre = M[:3, :3] @ body.means[feature] + M[:3, 3]
     if body.shape == "disk" and body.normals is not None:
         axis = M[:3, :3] @ body.normals[feature]

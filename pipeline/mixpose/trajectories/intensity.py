@@ -120,9 +120,8 @@ def _white(blocks: Sequence[Track], model: MotionModel, rules: SmoothingRules) -
             total -= float(block_logs.sum())
         return total
 
-    best = minimize_scalar(
-        unlikely, bounds=rules.shares, method="bounded", options={"xatol": rules.off / 2}
-    )
+    exactly = {"xatol": rules.off / 2}
+    best = minimize_scalar(unlikely, bounds=rules.shares, method="bounded", options=exactly)
     # the noise of steps converges from share to share: compare with a share of 1 at the end only
     is_sure = abs(best.x) > rules.off and 2 * (unlikely(0.0) - best.fun) > rules.surely
     return float(np.exp(best.x)) if is_sure else 1.0
@@ -143,7 +142,12 @@ def smooth_with_sudden_motion(
     """
     logs = np.zeros((len(track) - 1, 2)) if logs is None else logs
     for _ in range(rules.passes):
-        change = _fixed_point(track, model, logs, rules) - logs
+        scales = np.exp(logs)
+        step_noises = smooth_track(track, model, scales).step_noises
+        squared = np.stack([step.squared for step in step_noises])
+        degrees = np.stack([step.degrees for step in step_noises])
+        energy = scales * squared + rules.tail * _usual_scales(logs)
+        change = np.log(energy / (np.maximum(degrees, 0.0) + rules.tail)) - logs
         logs = logs + rules.ahead * change
         if np.abs(change).max(initial=0.0) < rules.settled:
             break
@@ -151,16 +155,6 @@ def smooth_with_sudden_motion(
     share = _usual_scales(logs) / np.exp(logs)
     prior = 0.5 * rules.tail * (np.log(share) - share).sum(axis=1)
     return result, result.logs + np.append(0.0, prior), logs
-
-
-def _fixed_point(track: Track, model: MotionModel, logs: Floats, rules: SmoothingRules) -> Floats:
-    """Return the next logarithms of λ (N - 1, 2)."""
-    scales = np.exp(logs)
-    step_noises = smooth_track(track, model, scales).step_noises
-    squared = np.stack([step.squared for step in step_noises])
-    degrees = np.stack([step.degrees for step in step_noises])
-    energy = scales * squared + rules.tail * _usual_scales(logs)
-    return np.asarray(np.log(energy / (np.maximum(degrees, 0.0) + rules.tail)))
 
 
 def _usual_scales(logs: Floats) -> Floats:

@@ -243,9 +243,8 @@ def _without_outliers(
         if not kept.measured[-1]:
             # the next pose begins a track; filled frames before it are predicted, too
             first = 1 + int(track.measured[1:].argmax())
-            kept, later = _without_outliers_after_first(
-                track.part(slice(first, None)), model, rules
-            )
+            remaining = track.part(slice(first, None))
+            kept, later = _without_outliers_after_first(remaining, model, rules)
             before = slice(None, -first - 1, -1)
             poses = np.concatenate([reversed_result.poses[before], later.poses])
             covariances = np.concatenate([reversed_result.covariances[before], later.covariances])

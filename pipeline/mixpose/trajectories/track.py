@@ -144,12 +144,8 @@ def smooth_track(track: Track, model: MotionModel, scales: Floats | None = None)
         states[k], step = smoothed(states[k], prediction, states[k + 1], F, steps[k], noises[k])
         step_noises.append(step)
     covariances = np.stack([state.covariances[0][:6, :6] for state in states])
-    return SmoothedTrack(
-        np.concatenate([state.poses for state in states]),
-        without_held(covariances, track.free),
-        tuple(reversed(step_noises)),
-        logs,
-    )
+    poses, noises_ahead = np.concatenate([s.poses for s in states]), tuple(reversed(step_noises))
+    return SmoothedTrack(poses, without_held(covariances, track.free), noises_ahead, logs)
 
 
 def without(track: Track, bad: Mask) -> Track:

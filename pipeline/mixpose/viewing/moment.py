@@ -80,10 +80,7 @@ def row_of(estimates: tuple[Estimate, ...]) -> Row:
         for name, report in estimate.sensors.items():
             if report.rms is not None and np.isfinite(report.rms):
                 residuals[name] = max(report.rms, residuals.get(name, 0.0))
+    statuses = tuple(estimate.status for estimate in estimates)
     poses = [estimate.T_world_object for estimate in estimates]
-    return Row(
-        estimates[0].frame,
-        tuple(estimate.status for estimate in estimates),
-        tuple(None if T is None else T[:3, 3] for T in poses),
-        residuals,
-    )
+    places = tuple(None if T is None else T[:3, 3] for T in poses)
+    return Row(estimates[0].frame, statuses, places, residuals)

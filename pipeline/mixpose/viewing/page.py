@@ -55,11 +55,8 @@ class Page:
             self._add_buttons(send, paused)
         self._series = Series(server.gui, session)
         self._scene = Scene(server, session)
-        self._magnified = server.gui.add_dropdown(
-            "covariance",
-            MAGNIFICATIONS,
-            hint="The ellipsoid that holds a position with 95 % is drawn so many times larger.",
-        )
+        hint = "The ellipsoid that holds a position with 95 % is drawn so many times larger."
+        self._magnified = server.gui.add_dropdown("covariance", MAGNIFICATIONS, hint=hint)
         self._magnified.on_update(self._on_magnified)
 
     def show(self, moment: Moment) -> None:
@@ -191,13 +188,8 @@ class Series:
         """Add frames to the plots."""
         self._rows.extend(rows)
         frames = np.array([row.frame for row in self._rows], dtype=np.float64)
-        self._status.data = (
-            frames,
-            *(
-                np.array([row.statuses.count(status) for row in self._rows], dtype=np.float64)
-                for status in STATUS_COLOURS
-            ),
-        )
+        counts = [[row.statuses.count(s) for row in self._rows] for s in STATUS_COLOURS]
+        self._status.data = (frames, *np.array(counts, dtype=np.float64))
         for names, plot in self._residuals:
             residuals = [[row.residuals.get(name, np.nan) for row in self._rows] for name in names]
             plot.data = (frames, *map(np.array, residuals))

@@ -35,8 +35,9 @@ _ASPECT = 0.65  # width over height of the part of the view that any window show
 _FILLED = 0.95  # share of this part that the scene fills
 _SMALL = 0.7  # size of letters over the usual one
 _GREY = (150, 150, 150)
-_GRID = ((50, 50, 50), (80, 80, 80))
+_GRID = {"cell_color": (50, 50, 50), "section_color": (80, 80, 80)}
 _LINE = {"thickness": 2.0, "thickness_units": "screen"}  # px
+_MARKERS = {"point_shape": "circle", "precision": "float32"}
 _POWERS = (1, 10, 100, 1000, 10000)
 _SEEN_SHARE = 0.1  # of a body's radius: an ellipsoid of this size is visible
 _ALONG_EDGE = 8  # rays along an edge of an image, as lenses bend edges
@@ -132,40 +133,30 @@ class Scene:
         return 1
 
     def _draw_sensor(self, k: int, outline: Outline, size: float) -> None:
-        scene = self._server.scene
+        scene, node = self._server.scene, f"/sensors/{k}"
         segments = self._scale * outline.segments(size)
         if len(segments):
-            scene.add_line_segments(f"/sensors/{k}", segments, _GREY, **_LINE)
-        scene.add_icosphere(
-            f"/sensors/{k}/place", 0.02, _GREY, position=self._scale * outline.places[0]
-        )
-        scene.add_label(
-            f"/sensors/{k}/name",
-            outline.name,
-            position=self._scale * outline.places.mean(axis=0),
-            font_screen_scale=_SMALL,
-        )
+            scene.add_line_segments(node, segments, _GREY, **_LINE)
+        middle = self._scale * outline.places.mean(axis=0)
+        scene.add_icosphere(f"{node}/place", 0.02, _GREY, position=self._scale * outline.places[0])
+        scene.add_label(f"{node}/name", outline.name, position=middle, font_screen_scale=_SMALL)
 
     def _draw_body(self, k: int, body: Body, estimate: Estimate) -> _BodyNodes:
-        scene, scale = self._server.scene, self._scale
+        scene, scale, node = self._server.scene, self._scale, f"/bodies/{k}"
         colour = _rgb(BODY_COLOURS[k % len(BODY_COLOURS)])
         length = 0.5 * scale * body.radius
-        pose = scene.add_frame(
-            f"/bodies/{k}", axes_length=length, axes_radius=0.03 * length, visible=False
-        )
+        pose = scene.add_frame(node, axes_length=length, axes_radius=0.03 * length, visible=False)
+        points, size = scale * body.means, 0.12 * length
         markers = scene.add_point_cloud(
-            f"/bodies/{k}/markers",
-            scale * body.means,
-            colour,
-            point_size=0.12 * length,
-            point_shape="circle",
-            precision="float32",
+            f"{node}/markers", points, colour, point_size=size, **_MARKERS
         )
-        edges = _skeleton(body.means)
-        if len(edges):
-            scene.add_line_segments(f"/bodies/{k}/shape", scale * edges, colour, **_LINE)
+        # the shortest segments that link all features
+        a, b = minimum_spanning_tree(squareform(pdist(body.means))).nonzero()
+        if len(a):
+            edges = scale * np.stack([body.means[a], body.means[b]], axis=1)
+            scene.add_line_segments(f"{node}/shape", edges, colour, **_LINE)
         if len(self._session.labels) > 1:
-            scene.add_label(f"/bodies/{k}/name", estimate.label, font_screen_scale=_SMALL)
+            scene.add_label(f"{node}/name", estimate.label, font_screen_scale=_SMALL)
         trail = scene.add_line_segments(f"/trails/{k}", np.zeros((0, 2, 3)), colour, **_LINE)
         ellipsoid = scene.add_icosphere(
             f"/covariance/{k}", 1.0, (255, 255, 255), opacity=0.4, visible=False, cast_shadow=False
@@ -189,10 +180,9 @@ class Scene:
             height=40 * cell,
             cell_size=cell,
             section_size=5 * cell,
-            cell_color=_GRID[0],
-            section_color=_GRID[1],
             wxyz=tuple(np.roll(turn.as_quat(), 1).tolist()),
             position=self._scale * below,
+            **_GRID,
         )
 
     def _look(self, bodies: Floats, radius: float, sensors: Floats, up: Floats) -> None:
@@ -226,14 +216,6 @@ class Scene:
                 camera.up = up
             camera.position = eye
             camera.look_at = aim
-
-
-def _skeleton(points: Floats) -> Floats:
-    """Return the shortest segments (n - 1, 2, 3) that link all points (n, 3)."""
-    if len(points) < 2:
-        return np.zeros((0, 2, 3))
-    a, b = minimum_spanning_tree(squareform(pdist(points))).nonzero()
-    return np.stack([points[a], points[b]], axis=1)
 
 
 def _wxyz(T: Floats) -> Floats:

@@ -86,12 +86,8 @@ class Viewer:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
         opened.callback(self._close)
-        self._process = context.Process(
-            target=show,
-            args=(place, theirs, self._session, self._on_files, self._paused),
-            name="mixpose page",
-            daemon=True,
-        )
+        shown = place, theirs, self._session, self._on_files, self._paused
+        self._process = context.Process(target=show, args=shown, name="mixpose page", daemon=True)
         with _interrupts_ignored():
             self._process.start()
         opened.callback(self._process.kill)
@@ -146,11 +142,8 @@ class Viewer:
         if len(self._estimates) < len(self._session.labels):
             return
         estimates, self._estimates = tuple(self._estimates), []
-        features = {
-            view.name: view.observation.pattern.points
-            for view in views
-            if isinstance(view.observation.pattern, PointPattern)
-        }
+        patterns = {view.name: view.observation.pattern for view in views}
+        features = {n: p.points for n, p in patterns.items() if isinstance(p, PointPattern)}
         with self._state:
             self._newest = frame_set, features, estimates
             self._rows.append(row_of(estimates))
