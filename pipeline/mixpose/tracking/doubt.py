@@ -41,6 +41,7 @@ from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, depth_reversed, is_flat, mirror_odds
 from mixpose.tracking.proposers import candidates_of, reason, starts_at
 from mixpose.tracking.rivals import log_odds_against
+from mixpose.tracking.track import Track
 
 TWICE = (
     "the body seems to be there twice: a mirror image, one more (`count`), or another like it, "
@@ -260,7 +261,7 @@ def reflection_mistake(data: Frame, judged: ScoredPose) -> Mistake:
     is_early = track.ok_count < data.rules.proposals.believed and before > -_largest_log_odds(data)
     # one sensor sees hardly more of a reversed depth than larger residuals
     is_far = len(judged.used.images) == 1 and judged.residual_ratio > 1
-    is_asked = before > 0 or (lasts and is_early) or is_far
+    is_asked = before > 0 or is_early or is_far
     odds = _log_odds_reflected(data, judged, is_asked, before)
     if odds == -math.inf:  # earlier evidence stays
         return Mistake(MIRRORED, MIRRORED, before, -math.inf)
@@ -291,9 +292,10 @@ def _log_odds_reflected(data: Frame, judged: ScoredPose, is_asked: bool, before:
         if is_asked or mirror_frame.finest.value(T) > value / 16:
             # fitted, which may end at clutter; and as it stands, if asked for
             rival = data.rival(judged, T, data.close_uncertainty, ahead=likely)
-            reversed_ = depth_reversed(data, judged, near_plane)
-            starts = [rival, *([Start(T), Start(reversed_)] if is_asked else [])]
+            starts = [rival, *([Start(T)] if is_asked else [])]
             near = max([_evidence(mirror_frame, start) for start in starts]) - body_evidence
+            if is_asked and not data.static_views:  # at rest, moving bodies meet nothing
+                near = max(near, _log_odds_from_afar(data, judged, near_plane))
             if near > likely:
                 return near
     if not _is_by_chance(data, judged):
@@ -308,6 +310,20 @@ def _log_odds_reflected(data: Frame, judged: ScoredPose, is_asked: bool, before:
     rivals = [rival for rival in candidates_of(mirror) if rival.evidence > least]
     log_odds = (_evidence(mirror, start) - body_evidence for start in starts_at(mirror, rivals))
     return next((odds for odds in log_odds if odds > likely), near if is_asked else -math.inf)
+
+
+def _log_odds_from_afar(data: Frame, judged: ScoredPose, near_plane: Mask) -> float:
+    """Return log odds of the mirror image with its depth reversed, with nothing known of either."""
+    alone = _by_itself(data)
+    start = Start(depth_reversed(data, judged, near_plane), alone.close_uncertainty)
+    body = _evidence(alone, Start(judged.T_world_object, left_out=judged.left_out))
+    return _evidence(_reflected_frame(alone, near_plane), start) - max(body, -1e9)
+
+
+def _by_itself(data: Frame) -> Frame:
+    """Return the frame with nothing from the frames before, but noise that several ok ones tell."""
+    alone, is_known = data.alone(), data.track.ok_count >= data.rules.proposals.believed
+    return alone if is_known else alone.changed(track=Track())
 
 
 def _is_by_chance(data: Frame, judged: ScoredPose) -> bool:
