@@ -104,9 +104,23 @@ def twist_between(T_from: Floats, T_to: Floats) -> Floats:
         return twist
     if R_difference.shape == (1, 3, 3):
         return twist_between(T_from.reshape(4, 4), T_to.reshape(4, 4))[None]
-    vectors = Rotation.from_matrix(R_difference.reshape(-1, 3, 3)).as_rotvec()
     shift = T_to[..., :3, 3] - T_from[..., :3, 3]
-    return np.concatenate([shift, vectors.reshape(shift.shape)], axis=-1)
+    twists = np.empty((*R_difference.shape[:-2], 6))
+    twists[..., :3] = shift
+    twists[..., 3:] = _rotation_vectors(R_difference.reshape(-1, 3, 3)).reshape(shift.shape)
+    return twists
+
+
+def _rotation_vectors(R: Floats) -> Floats:
+    """Return rotation vectors (K, 3) of rotation matrices (K, 3, 3)."""
+    axes = (R - R.swapaxes(1, 2)).reshape(-1, 9).take([7, 2, 3], axis=1)  # as in `twist_between`
+    lengths, cosines = np.sqrt(np.vecdot(axes, axes)), R.trace(axis1=1, axis2=2) - 1
+    turned, angles = lengths > 0, np.arctan2(lengths, cosines)
+    vectors = axes * np.divide(angles, lengths, out=np.full(len(R), 0.5), where=turned)[:, None]
+    wide = cosines <= 0
+    if np.count_nonzero(wide):  # the sine does not tell the axis of half a turn
+        vectors[wide] = Rotation.from_matrix(R[wide]).as_rotvec()
+    return np.asarray(vectors)
 
 
 def cross(a: Floats, b: Floats) -> Floats:

@@ -76,8 +76,8 @@ MUTANTS = (
     Mutant(
         "judgement-turns-about-one-axis-only",
         "judgement/nonlinear.py",
-        "combinations_with_replacement(range(3), 2):",
-        "[(2, 2)]:",
+        "_PAIRS_OF_AXES = np.triu_indices(3)",
+        "_PAIRS_OF_AXES = np.array([[2], [2]])",
         "an origin aside of a board that may be turned about two axes is said to be exact",
         (_TILTS,),
     ),

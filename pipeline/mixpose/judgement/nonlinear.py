@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations_with_replacement
 
 import numpy as np
 from scipy.special import chdtri
@@ -20,7 +19,7 @@ from mixpose.matching import Matches
 from mixpose.objective import BodyProjection
 from mixpose.optimise import Quadratic, squares_of, stepped
 from mixpose.records import Floats, Mask
-from mixpose.rigid import perturb, twist_between
+from mixpose.rigid import cross, perturb, twist_between
 
 _LEAST_TURN = 0.01  # rad: the origin leaves its tangent by 5e-5 of its lever
 _WIDEST_TURN = 1.0  # rad: a wider turn is another pose
@@ -30,6 +29,7 @@ _RAYS = 12
 # more of boards, triangles and bars at 4 to 40 times their size
 _REACHES = np.array([1.0, 1.4, 2.0])
 _STEPS = 3
+_PAIRS_OF_AXES = np.triu_indices(3)
 
 
 def with_likely_turns(
@@ -78,16 +78,15 @@ def with_wide_turn(covariance: Floats, T_world_object: Floats, points: Floats) -
     """
     if not _is_wide(covariance):
         return covariance
-    variances, columns = np.linalg.eigh(covariance[3:, 3:])
-    axes, lever = columns.T, -T_world_object[:3, :3] @ points.mean(axis=0)
-    along = np.cross(axes, lever)
-    twice = np.cross(axes[:, None], along)  # about an axis, then about another one
+    variances, axes = np.linalg.eigh(covariance[3:, 3:])
+    lever = -T_world_object[:3, :3] @ points.mean(axis=0)
+    along = cross(axes, lever[:, None])
+    twice = cross(axes[:, :, None], along[:, None])  # about an axis, then about another one
     wider, deviations = covariance.copy(), np.sqrt(np.maximum(variances, 0.0))
-    for a, b in combinations_with_replacement(range(3), 2):
-        inwards = twice[a, b] + twice[b, a]
-        wider[:3, :3] += (deviations[a] * deviations[b]) ** 2 * np.outer(inwards, inwards)
-    back = math.sqrt(5) * deviations[:, None] ** 3 * along
-    wider[:3, :3] += back.T @ back
+    a, b = _PAIRS_OF_AXES
+    inwards = deviations[a] * deviations[b] * (twice[:, a, b] + twice[:, b, a])
+    back = math.sqrt(5) * deviations**3 * along
+    wider[:3, :3] += inwards @ inwards.T + back @ back.T
     return wider
 
 
