@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from mixpose.judgement.judge import ScoredPose
 from mixpose.judgement.noise import NoiseModel
 from mixpose.judgement.shape import Shape
 from mixpose.matching import LEAST_VARIANCE, Matches
-from mixpose.records import Floats, Mask, Status
+from mixpose.records import Floats, Mask, Status, replace
 from mixpose.rigid import twist_between
 
 LEAST_BELIEF = 1e-12

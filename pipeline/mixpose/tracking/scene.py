@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import permutations
 from operator import itemgetter
@@ -26,7 +26,7 @@ from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.judgement import Alternative, Verdict
 from mixpose.objective import View, project_body
-from mixpose.records import Estimate, Floats, Mask
+from mixpose.records import Estimate, Floats, Mask, replace
 from mixpose.rigid import transform
 from mixpose.sensors import Sensor
 from mixpose.tracking.confusion import confusions_of

@@ -8,7 +8,7 @@ session file, claims its detections, and bodies that had met any of these are so
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -20,7 +20,7 @@ from mixpose.fit import Fit, fit_together
 from mixpose.judgement import Case, ScoredPose, Verdict, insert, is_possible, judge_together
 from mixpose.objective import SharedDensities, View, has_bare_points, matched_objective
 from mixpose.optimise import Ascent
-from mixpose.records import Floats, Mask
+from mixpose.records import Floats, Mask, replace
 from mixpose.search import SeenTogether, search_copies
 from mixpose.tracking.claims import Claims, Met
 from mixpose.tracking.doubt import decide_frame

@@ -15,7 +15,7 @@ frames; before the first nothing is known.  Configured radii of markers are fact
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -25,7 +25,7 @@ from mixpose.constants import constant
 from mixpose.density import DRAWING
 from mixpose.judgement import ScoredPose
 from mixpose.objective import View, project_body
-from mixpose.records import Floats, Indices, Mask, PointPattern
+from mixpose.records import Floats, Indices, Mask, PointPattern, replace
 from mixpose.rigid import cross
 
 _TINY = float(np.finfo(np.float64).tiny)

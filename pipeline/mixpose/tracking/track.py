@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -21,7 +21,7 @@ from mixpose.judgement import (
     nearest_alike,
 )
 from mixpose.objective import View
-from mixpose.records import DelayEstimate, Floats, Mask
+from mixpose.records import DelayEstimate, Floats, Mask, replace
 from mixpose.rigid import inverse, perturb, twist_between
 from mixpose.search import SearchState
 from mixpose.tracking.motion import Distances, MotionFilter, MotionRules, RandomWalk, per_kind

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
 
@@ -16,7 +16,7 @@ from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, Fit, free_mask
 from mixpose.judgement import APART, ClutterRates, ScoredPose, Verdict, insert
 from mixpose.objective import View
-from mixpose.records import Estimate, Floats, Hypothesis, SensorReport, label_of
+from mixpose.records import Estimate, Floats, Hypothesis, SensorReport, label_of, replace
 from mixpose.rigid import from_parts
 from mixpose.search import is_pointlike
 from mixpose.threads import one_blas_thread
