@@ -26,6 +26,7 @@ TWIST_NAMES = ("x", "y", "z", "rx", "ry", "rz")
 
 _NEXT = np.array([1, 2, 0])  # the axis that follows each axis
 _CHI2_95 = 7.815  # 95 % quantile for three degrees of freedom
+_HALF_TURN = 0.1  # twice the sine of 177°: nearer to half a turn axes by sines lose two digits
 
 
 def transform(T_a_b: Floats, points_b: Floats) -> Floats:
@@ -117,9 +118,9 @@ def _rotation_vectors(R: Floats) -> Floats:
     lengths, cosines = np.sqrt(np.vecdot(axes, axes)), R.trace(axis1=1, axis2=2) - 1
     turned, angles = lengths > 0, np.arctan2(lengths, cosines)
     vectors = axes * np.divide(angles, lengths, out=np.full(len(R), 0.5), where=turned)[:, None]
-    wide = cosines <= 0
-    if np.count_nonzero(wide):  # the sine does not tell the axis of half a turn
-        vectors[wide] = Rotation.from_matrix(R[wide]).as_rotvec()
+    halves = (cosines < 0) & (lengths < _HALF_TURN)
+    if np.count_nonzero(halves):
+        vectors[halves] = Rotation.from_matrix(R[halves]).as_rotvec()
     return np.asarray(vectors)
 
 
@@ -131,7 +132,7 @@ def cross(a: Floats, b: Floats) -> Floats:
 def covariance_at(covariance: Floats, arm: Floats) -> Floats:
     """Move a pose's covariance (..., 6, 6) from its origin by an arm (..., 3) in world axes."""
     J = np.zeros((*np.shape(arm)[:-1], 6, 6))
-    J[..., range(6), range(6)] = 1.0
+    J.reshape(-1, 36)[:, ::7] = 1.0
     x, y, z = np.asarray(arm).T
     # a turn w moves the point by w × arm
     J[..., 0, 4], J[..., 0, 5], J[..., 1, 5] = z.T, -y.T, x.T
