@@ -11,10 +11,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body, PointFeature
-from mixpose.judgement import with_likely_turns, with_wide_turn
+from mixpose.judgement import Curved, with_likely_turns, with_wide_turn
 from mixpose.matching import Matches
 from mixpose.objective import BodyProjection, project_body
-from mixpose.records import Floats
+from mixpose.records import Floats, Mask
 from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform, twist_between
 from mixpose.sensors import PinholeCamera
 
@@ -47,11 +47,19 @@ def fitted(T_true: Floats, seed: int) -> tuple[Floats, Matches, BodyProjection]:
     return T, matches_of(Seen(at.J[0, 0], offsets=seen - places, places=places)), projection
 
 
+def turned(
+    covariance: Floats, T: Floats, seen: Matches, projection: BodyProjection, free: Mask = FREE
+) -> Floats:
+    """The covariance with all likely turns."""
+    curved = Curved(covariance, T, seen, np.array([NOISE**2]), projection)
+    return with_likely_turns([curved], free)[0]
+
+
 def covariances(T: Floats, found: Matches, projection: BodyProjection) -> tuple[Floats, Floats]:
     """By the curvature at the pose, and with all likely turns."""
     J = found.J[0].reshape(-1, 6)
     plain = NOISE**2 * np.linalg.inv(J.T @ J)
-    return plain, with_likely_turns(plain, T, found, np.array([NOISE**2]), projection, FREE)
+    return plain, turned(plain, T, found, projection)
 
 
 def squares(T_true: Floats, T: Floats, covariance: Floats) -> float:
@@ -99,14 +107,14 @@ def test_how_well_noise_is_known_makes_no_turn_likelier(larger: float) -> None:
     T, found, projection = fitted(from_rotation_vector(turn, np.array([5.0, -8.0, 2000.0])), 6)
     before = larger * covariances(T, found, projection)[0]
     assert np.sqrt(before[3:, 3:].trace()) > 0.01
-    after = with_likely_turns(before, T, found, np.array([NOISE**2]), projection, FREE)
+    after = turned(before, T, found, projection)
     assert after[3:, 3:].trace() < 1.1 * before[3:, 3:].trace()
 
 
 def test_what_no_turn_explains_makes_none_less_likely() -> None:
     """Offsets that no pose takes away are there at all turns alike."""
     T, found, projection = fitted(from_rotation_vector([0.04, 0.05, 0], [0, 0, 500.0]), 2)
-    J, variances = found.J[0].reshape(-1, 6), np.array([NOISE**2])
+    J = found.J[0].reshape(-1, 6)
     before = NOISE**2 * np.linalg.inv(J.T @ J)
     r = np.random.default_rng(5).normal(size=len(J))
     r -= J @ np.linalg.lstsq(J, r)[0]
@@ -114,10 +122,23 @@ def test_what_no_turn_explains_makes_none_less_likely() -> None:
     for squared in (0.01, 18.0):  # of the 22.5 by which a likely turn may be worse
         rest = r * np.sqrt(squared * NOISE**2 / (r @ r))
         seen = replace(found, offsets=rest.reshape(found.offsets.shape))
-        after = with_likely_turns(before, T, seen, variances, projection, FREE)
+        after = turned(before, T, seen, projection)
         sizes.append(after[3:, 3:].trace() / before[3:, 3:].trace())
     assert min(sizes) > 1.3
     assert max(sizes) < 1.5 * min(sizes)
+
+
+def test_several_poses_at_once_are_turned_as_each_by_itself() -> None:
+    poses, alone = list[Curved](), list[Floats]()
+    for seed, tilt in enumerate((0.04, 0.7, 0.05, 0.06)):
+        T, found, projection = fitted(from_rotation_vector([tilt, 0.05, 0], [0, 0, 500.0]), seed)
+        before, after = covariances(T, found, projection)
+        poses.append(Curved(before, T, found, np.array([NOISE**2]), projection))
+        alone.append(after)
+    together = with_likely_turns(poses, FREE)
+    np.testing.assert_allclose(together, alone, rtol=1e-9, atol=1e-15)
+    changed = [after is not pose.covariance for after, pose in zip(together, poses, strict=True)]
+    assert changed == [True, False, True, True]
 
 
 def test_directions_that_are_held_stay_so() -> None:
@@ -126,7 +147,7 @@ def test_directions_that_are_held_stay_so() -> None:
     J = found.J[0].reshape(-1, 6)[:, free]
     before = np.zeros((6, 6))
     before[np.ix_(free, free)] = NOISE**2 * np.linalg.inv(J.T @ J)
-    after = with_likely_turns(before, T, found, np.array([NOISE**2]), projection, free)
+    after = turned(before, T, found, projection, free)
     assert not after[~free].any()
     assert not after[:, ~free].any()
     assert after[3:, 3:].trace() > 1.2 * before[3:, 3:].trace()
@@ -135,8 +156,7 @@ def test_directions_that_are_held_stay_so() -> None:
 def test_a_pose_that_nothing_fixes_is_left_as_open_as_it_is() -> None:
     T, found, projection = fitted(from_rotation_vector([0.04, 0.05, 0], [0, 0, 500.0]), 3)
     before = np.diag([1.0, 1.0, np.inf, 0.01, 0.01, np.inf])
-    variances = np.array([NOISE**2])
-    assert with_likely_turns(before, T, found, variances, projection, FREE) is before
+    assert turned(before, T, found, projection) is before
 
 
 def test_what_leaves_the_view_by_a_turn_is_not_as_likely() -> None:
@@ -144,7 +164,7 @@ def test_what_leaves_the_view_by_a_turn_is_not_as_likely() -> None:
     T, found, projection = fitted(from_rotation_vector([0.04, 0.05, 0], [165.0, 0, 500.0]), 4)
     J = found.J[0].reshape(-1, 6)
     before = 100 * NOISE**2 * np.linalg.inv(J.T @ J)
-    after = with_likely_turns(before, T, found, np.array([NOISE**2]), projection, FREE)
+    after = turned(before, T, found, projection)
     assert np.isfinite(after).all()
     assert np.linalg.eigvalsh(after)[0] > 0
 

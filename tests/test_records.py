@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 import mixpose
 from mixpose.body import Body, PointFeature
-from mixpose.records import Estimate, PointPattern, SensorReport
+from mixpose.records import Estimate, PointPattern, SensorReport, replace
 from mixpose.rigid import from_rotation_vector
 from mixpose.sensors import PinholeCamera
 
@@ -32,6 +33,17 @@ def test_points_that_cannot_be_meant_are_refused(
 ) -> None:
     with pytest.raises(ValueError, match=said):
         PointPattern(points, weights)
+
+
+def test_a_record_with_other_fields_keeps_the_rest_and_nothing_computed_from_them() -> None:
+    estimate = Estimate(3, None, "wand", "ok", np.eye(4), np.eye(6), 0.9, {})
+    assert estimate.offsets == {}
+    changed = replace(estimate, status="lost", covariance=None)
+    assert vars(changed) == vars(dataclasses.replace(estimate, status="lost", covariance=None))
+    pattern = replace(PointPattern(POINTS, np.ones(2)), points=[[1, 2], [3, 4]])  # type: ignore[arg-type]
+    assert pattern.points.dtype == np.float64  # checked as if it were new
+    with pytest.raises(TypeError, match=r"found \['state'\]; allowed: \['frame',"):
+        replace(estimate, state="ok")  # type: ignore[call-arg]
 
 
 def test_lists_and_other_types_become_float64() -> None:

@@ -8,11 +8,12 @@ integers) for cameras, lengths for ranges.  A camera has m = 2 coordinates, a ra
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,28 @@ Singles: TypeAlias = NDArray[np.float32]
 Indices: TypeAlias = NDArray[np.intp]
 Mask: TypeAlias = NDArray[np.bool_]
 Image: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
+
+
+if TYPE_CHECKING:  # which fields there are, and of which types
+    from dataclasses import replace as replace  # noqa: PLC0414, exported
+else:
+
+    def replace(record: Any, /, **changes: Any) -> Any:
+        """Return a record with other fields, in a third of the time of the standard library's.
+
+        Only records that check or complete their fields are made as if they were new.
+        """
+        kind, known = type(record), record.__dict__
+        if hasattr(kind, "__post_init__"):
+            return dataclasses.replace(record, **changes)
+        names = kind.__match_args__
+        fields = dict(zip(names, map(known.__getitem__, names), strict=True))
+        fields.update(changes)
+        if len(fields) > len(names):
+            raise TypeError(f"{kind.__name__}: found {[*changes]}; allowed: {[*names]}")
+        changed = object.__new__(kind)
+        object.__setattr__(changed, "__dict__", fields)  # without what was computed from others
+        return changed
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ TWIST_NAMES = ("x", "y", "z", "rx", "ry", "rz")
 
 _NEXT = np.array([1, 2, 0])  # the axis that follows each axis
 CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815}  # 95 % quantiles of χ² by degrees of freedom
+_HALF_TURN = 0.1  # twice the sine of 177°: nearer to half a turn axes by sines lose two digits
 
 
 def transform(T_a_b: Floats, points_b: Floats) -> Floats:
@@ -104,9 +105,23 @@ def twist_between(T_from: Floats, T_to: Floats) -> Floats:
         return twist
     if R_difference.shape == (1, 3, 3):
         return twist_between(T_from.reshape(4, 4), T_to.reshape(4, 4))[None]
-    vectors = Rotation.from_matrix(R_difference.reshape(-1, 3, 3)).as_rotvec()
     shift = T_to[..., :3, 3] - T_from[..., :3, 3]
-    return np.concatenate([shift, vectors.reshape(shift.shape)], axis=-1)
+    twists = np.empty((*R_difference.shape[:-2], 6))
+    twists[..., :3] = shift
+    twists[..., 3:] = _rotation_vectors(R_difference.reshape(-1, 3, 3)).reshape(shift.shape)
+    return twists
+
+
+def _rotation_vectors(R: Floats) -> Floats:
+    """Return rotation vectors (K, 3) of rotation matrices (K, 3, 3)."""
+    axes = (R - R.swapaxes(1, 2)).reshape(-1, 9).take([7, 2, 3], axis=1)  # as in `twist_between`
+    lengths, cosines = np.sqrt(np.vecdot(axes, axes)), R.trace(axis1=1, axis2=2) - 1
+    turned, angles = lengths > 0, np.arctan2(lengths, cosines)
+    vectors = axes * np.divide(angles, lengths, out=np.full(len(R), 0.5), where=turned)[:, None]
+    halves = (cosines < 0) & (lengths < _HALF_TURN)
+    if np.count_nonzero(halves):
+        vectors[halves] = Rotation.from_matrix(R[halves]).as_rotvec()
+    return np.asarray(vectors)
 
 
 def cross(a: Floats, b: Floats) -> Floats:
@@ -123,7 +138,7 @@ def covariance_at(covariance: Floats, arm: Floats) -> Floats:
 def twists_at(arm: Floats) -> Floats:
     """Return matrices (..., 6, 6) to the twists of what is arms (..., 3) from the origin."""
     J = np.zeros((*np.shape(arm)[:-1], 6, 6))
-    J[..., range(6), range(6)] = 1.0
+    J.reshape(-1, 36)[:, ::7] = 1.0
     x, y, z = np.asarray(arm).T
     # a turn w moves the point by w × arm
     J[..., 0, 4], J[..., 0, 5], J[..., 1, 5] = z.T, -y.T, x.T

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from os import PathLike, fspath
 from pathlib import Path
@@ -27,6 +27,7 @@ from mixpose.records import (
     PointPattern,
     RawFrame,
     SensorReport,
+    replace,
 )
 from mixpose.selection import Selection
 from mixpose.sensors import CloudSensor, perturbed

@@ -138,8 +138,8 @@ MUTANTS = (
     Mutant(
         "judgement-most-turned-twin",
         "judgement/acceptance.py",
-        "sum(axis=(-2, -1)).argmax(axis=-1)",
-        "sum(axis=(-2, -1)).argmin(axis=-1)",
+        "turns_back.T).argmax(axis=-1)",
+        "turns_back.T).argmin(axis=-1)",
         "of poses that look the same the farthest is told",
     ),
     Mutant(

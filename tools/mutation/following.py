@@ -37,8 +37,8 @@ _PREDICTION = (
     Mutant(
         "tracking-predictions-without-tails",
         "tracking/track.py",
-        "if self.spread is not None:",
-        "if True:",
+        "if self.spread is None:",
+        "if False:",
         "a body that turns suddenly is lost",
     ),
     Mutant(

@@ -122,8 +122,8 @@ MUTANTS = (
     Mutant(
         "tracking-ranges-unlikely-poses-expected-as-likely-ones",
         "tracking/frame.py",
-        "logs = np.logaddexp(logs, branch.log_belief(surprise) + near)",
-        "logs = np.logaddexp(logs, near)",
+        "logs[k] = np.logaddexp(logs[k], branch.log_belief(surprise) + logs_near)",
+        "logs[k] = np.logaddexp(logs[k], logs_near)",
         "where the track is most likely wrong a better pose elsewhere is not looked for",
         (_MAXIMA,),
     ),

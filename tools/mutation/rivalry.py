@@ -66,8 +66,8 @@ MUTANTS = (
     Mutant(
         "tracking-covariance-of-the-middle",
         "tracking/reporting.py",
-        "covariance = covariance_at(covariance, T[:3, :3] @ origin)",
-        "covariance_at(covariance, T[:3, :3] @ origin)",
+        "T[:3, :3] @ origin)",
+        "0 * T[:3, :3] @ origin)",
         "a tip that is far from the markers seems to be known as well as they are",
         (_RIVALS,),
     ),

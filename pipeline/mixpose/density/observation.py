@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -19,7 +19,16 @@ from scipy.spatial import cKDTree
 
 from mixpose.density.atlas import Atlas, remap
 from mixpose.density.blur import DRAWING, blurred, mass, odd_factor, reduced
-from mixpose.records import Floats, GridPattern, Indices, Mask, Pattern, PointPattern, Singles
+from mixpose.records import (
+    Floats,
+    GridPattern,
+    Indices,
+    Mask,
+    Pattern,
+    PointPattern,
+    Singles,
+    replace,
+)
 
 
 @dataclass(frozen=True)

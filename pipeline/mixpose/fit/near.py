@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal, TypeAlias
 
@@ -42,7 +42,7 @@ from mixpose.objective import (
     with_heights,
 )
 from mixpose.optimise import Ascent, NewtonOptions, ascend
-from mixpose.records import Floats, Mask
+from mixpose.records import Floats, Mask, replace
 from mixpose.rigid import TWIST_NAMES, perturb, twist_between
 from mixpose.sensors import Motion
 

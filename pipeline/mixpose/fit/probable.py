@@ -13,7 +13,7 @@ misfits of ν redundant coordinates are normal; see *A body that does not fit* i
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import combinations, product
 from typing import Any
@@ -33,7 +33,7 @@ from mixpose.objective import (
 )
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
 from mixpose.optimise import NewtonOptions, Quadratic, Sum, Term, ascend, squares_of
-from mixpose.records import Floats, Indices, Mask
+from mixpose.records import Floats, Indices, Mask, replace
 from mixpose.rigid import perturb, transform
 from mixpose.sensors import Sensor
 

@@ -44,6 +44,7 @@ from mixpose.judgement.information import (
     inverted as inverted,
 )
 from mixpose.judgement.nonlinear import (
+    Curved as Curved,
     with_likely_turns as with_likely_turns,
     with_wide_turn as with_wide_turn,
 )

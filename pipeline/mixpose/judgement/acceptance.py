@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ from mixpose.judgement.mistakes import Mistake
 from mixpose.judgement.noise import NoiseModel
 from mixpose.judgement.shape import Shape
 from mixpose.matching import LEAST_VARIANCE, Matches
-from mixpose.records import Floats, Mask, Status
+from mixpose.records import Floats, Mask, Status, replace
 from mixpose.rigid import twist_between
 
 LEAST_BELIEF = 1e-12
@@ -387,17 +387,17 @@ def is_far_off(used: Matches, before: Floats, rules: AcceptanceRules, model: Noi
 
 
 def nearest_alike(T_world_object: Floats, body: Body, T_reference: Floats | None) -> Floats:
-    """Return the look-alikes of poses (..., 4, 4) that are turned least against a reference.
+    """Return the look-alikes of poses (..., 4, 4) that are turned least against references.
 
-    Without a reference, against the world.
+    References broadcast over leading axes.  Without a reference, against the world.
     """
     if len(body.symmetries) == 1:
         return T_world_object
     R = T_world_object[..., :3, :3]
-    turned = R if T_reference is None else T_reference[:3, :3].T @ R
+    turned = R if T_reference is None else T_reference[..., :3, :3].swapaxes(-1, -2) @ R
     # the angle grows as the trace of the difference falls
-    traces = body.symmetries[:, :3, :3] * turned.swapaxes(-1, -2)[..., None, :, :]
-    nearest = traces.sum(axis=(-2, -1)).argmax(axis=-1)
+    turns_back = body.symmetries[:, :3, :3].swapaxes(1, 2).reshape(-1, 9)
+    nearest = (turned.reshape(*turned.shape[:-2], 9) @ turns_back.T).argmax(axis=-1)
     # the same array, if nothing is turned: results cached for it are valid
     is_same = not np.count_nonzero(nearest - body.identity)
     return T_world_object if is_same else T_world_object @ body.symmetries[nearest]

@@ -16,6 +16,7 @@ multiple of χ² with the same two.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 
 import numpy as np
 from scipy.special import chdtri, fdtrc, fdtri
@@ -111,13 +112,19 @@ def _larger(
     shares = np.concatenate([chances.ravel(), [1 - float(chances.sum())]])
     is_likely = shares > 1e-12  # most of many cases are next to impossible
     degrees, limits, shares = degrees[is_likely], limits[is_likely], shares[is_likely]
-    # of most poses the first or the second factor is enough
-    enough = (
-        factor
-        for factor in LARGER[:-1]
-        if fdtrc(degrees, noise_degrees, factor * limits / degrees) @ shares <= outside
-    )
-    return next(enough, LARGER[-1])
+
+    def is_enough(number: int) -> bool:
+        factors = LARGER[number] * limits / degrees
+        return bool(fdtrc(degrees, noise_degrees, factors) @ shares <= outside)
+
+    # as a rule it is the factor for noise alone
+    last, alone = len(LARGER) - 1, _larger_by_noise(len(C), noise_degrees, outside)
+    number = min(bisect_left(LARGER, alone), last)
+    while number > 0 and is_enough(number - 1):
+        number -= 1
+    while number < last and not is_enough(number):
+        number += 1
+    return LARGER[number]
 
 
 def _larger_by_noise(count: int, degrees: float, outside: float) -> float:

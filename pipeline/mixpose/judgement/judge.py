@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from mixpose.judgement.information import information_of, inverted
 from mixpose.judgement.noise import NoiseModel, RememberedNoise, noise_of
 from mixpose.matching import AssociationRules, Matches, NoiseEstimate, associate
 from mixpose.objective import MatchedObjective
-from mixpose.records import Floats, Indices, Mask, SensorReport
+from mixpose.records import Floats, Indices, Mask, SensorReport, replace
 
 
 class Case(NamedTuple):

@@ -230,6 +230,8 @@ def _fitted(
 
 def _names_of(matches: Matches) -> list[str]:
     """Return the names of mistakes in the order of `_columns`: a size, all sensors, and lenses."""
+    if matches.owners is None:
+        return [SIZE, *matches.names, LENS]
     firsts = np.unique(matches.owner, return_index=True)[1].tolist()
     return [SIZE, *[matches.names[k] for k in firsts], LENS]
 

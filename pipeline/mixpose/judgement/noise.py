@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
@@ -41,7 +41,7 @@ from mixpose.matching import (
     pooled,
     residual_ratio,
 )
-from mixpose.records import Floats, Mask
+from mixpose.records import Floats, Mask, replace
 
 Biases: TypeAlias = Mapping[tuple[str, ...], Floats]
 

@@ -8,9 +8,9 @@ body that nearly faces its one camera, where turns to either side look almost al
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import combinations_with_replacement
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -20,7 +20,7 @@ from mixpose.matching import Matches
 from mixpose.objective import BodyProjection
 from mixpose.optimise import Quadratic, squares_of, stepped
 from mixpose.records import Floats, Mask
-from mixpose.rigid import perturb, twist_between
+from mixpose.rigid import cross, perturb, twist_between
 
 _LEAST_TURN = 0.01  # rad: the origin leaves its tangent by 5e-5 of its lever
 _WIDEST_TURN = 1.0  # rad: a wider turn is another pose
@@ -30,37 +30,57 @@ _RAYS = 12
 # more of boards, triangles and bars at 4 to 40 times their size
 _REACHES = np.array([1.0, 1.4, 2.0])
 _STEPS = 3
+_PAIRS_OF_AXES = np.triu_indices(3)
 
 
-def with_likely_turns(
-    covariance: Floats,  # (6, 6)
-    T_world_object: Floats,  # (4, 4)
-    seen: Matches,  # at the pose, of the sensors that took part
-    variances: Floats,  # (L,) of their noise, σ_ε²
-    projection: BodyProjection,  # of these sensors
-    free: Mask,
-) -> Floats:
-    """Return a covariance (6, 6) whose ellipsoid of 99.9 % holds all turns as likely as its edge.
+class Curved(NamedTuple):
+    """A pose with the covariance of its curvature, and what it meets."""
+
+    covariance: Floats  # (6, 6)
+    T_world_object: Floats  # (4, 4)
+    seen: Matches  # at the pose, of the sensors that took part
+    variances: Floats  # (L,) of their noise, σ_ε²
+    projection: BodyProjection  # of these sensors
+
+
+def with_likely_turns(poses: Sequence[Curved], free: Mask) -> list[Floats]:
+    """Return covariances (6, 6) whose ellipsoids of 99.9 % hold all turns as likely as their edges.
 
     Turns are tried on rays in the plane of the two that are least known, with the other directions
-    at their likeliest.  If a twist x as likely as the edge is m > h squared deviations away, h at
-    the edge, the covariance grows by (1/h − 1/m) x xᵀ, which puts x on the edge.
+    at their likeliest; those of equal bodies in the same sensors all at once.  If a twist x as
+    likely as the edge is m > h squared deviations away, h at the edge, the covariance grows by
+    (1/h − 1/m) x xᵀ, which puts x on the edge.
     """
-    if not _is_wide(covariance):
-        return covariance
-    about = _Turns.about(covariance, T_world_object, seen, variances, projection, free)
-    if about is None:
-        return covariance
+    covariances, equal = [pose.covariance for pose in poses], dict[BodyProjection, list[int]]()
+    for k, pose in enumerate(poses):
+        if _is_wide(pose.covariance):
+            equal.setdefault(pose.projection, []).append(k)
     angles = np.arange(_RAYS) * (2 * np.pi / _RAYS)
     rays = math.sqrt(_HELD) * np.array([np.cos(angles), np.sin(angles)]).T
-    fallen, poses = about.fallen((rays[:, None] * _REACHES[:, None]).reshape(-1, 2))
-    away = np.append(fallen.reshape(_RAYS, -1), np.full((_RAYS, 1), np.inf), axis=1)
-    likely = away[:, 0] < _HELD
-    last = np.maximum(np.argmax(away >= _HELD, axis=1) - 1, 0)
-    ends = poses.reshape(_RAYS, -1, 4, 4)[np.arange(_RAYS), last][likely]
+    tried = (rays[:, None] * _REACHES[:, None]).reshape(-1, 2)
+    for group in equal.values():
+        wide, turns = _Turns.about([poses[k] for k in group], free)
+        if turns is None:
+            continue
+        fallen, states = turns.fallen(tried)
+        away = fallen.reshape(-1, _RAYS, len(_REACHES))
+        likely = away[..., 0] < _HELD
+        beyond = np.append(away, np.full((*likely.shape, 1), np.inf), axis=2) >= _HELD
+        last = np.maximum(np.argmax(beyond, axis=2) - 1, 0)[..., None, None, None]
+        reached = states.reshape(*away.shape, 4, 4)
+        ends = np.take_along_axis(reached, last, axis=2)[:, :, 0]
+        for j in np.flatnonzero(likely.any(axis=1)).tolist():
+            pose = poses[k := group[wide[j]]]
+            twists = twist_between(pose.T_world_object, ends[j, likely[j]])
+            covariances[k] = _holding(covariances[k], twists[:, free], free)
+    return covariances
+
+
+def _holding(covariance: Floats, twists: Floats, free: Mask) -> Floats:
+    """Return a covariance (6, 6) that grows until its ellipsoid holds free twists (K, k)."""
     wider, inner = covariance.copy(), np.ix_(free, free)
     inverse = inverted(wider[inner])
-    for x in twist_between(T_world_object, ends)[:, free]:
+    for x in twists:
         by = inverse @ x
         if (m := float(x @ by)) > _HELD:
             wider[inner] += (1 / _HELD - 1 / m) * np.outer(x, x)
@@ -78,16 +98,15 @@ def with_wide_turn(covariance: Floats, T_world_object: Floats, points: Floats) -
     """
     if not _is_wide(covariance):
         return covariance
-    variances, columns = np.linalg.eigh(covariance[3:, 3:])
-    axes, lever = columns.T, -T_world_object[:3, :3] @ points.mean(axis=0)
-    along = np.cross(axes, lever)
-    twice = np.cross(axes[:, None], along)  # about an axis, then about another one
+    variances, axes = np.linalg.eigh(covariance[3:, 3:])
+    lever = -T_world_object[:3, :3] @ points.mean(axis=0)
+    along = cross(axes, lever[:, None])
+    twice = cross(axes[:, :, None], along[:, None])  # about an axis, then about another one
     wider, deviations = covariance.copy(), np.sqrt(np.maximum(variances, 0.0))
-    for a, b in combinations_with_replacement(range(3), 2):
-        inwards = twice[a, b] + twice[b, a]
-        wider[:3, :3] += (deviations[a] * deviations[b]) ** 2 * np.outer(inwards, inwards)
-    back = math.sqrt(5) * deviations[:, None] ** 3 * along
-    wider[:3, :3] += back.T @ back
+    a, b = _PAIRS_OF_AXES
+    inwards = deviations[a] * deviations[b] * (twice[:, a, b] + twice[:, b, a])
+    back = math.sqrt(5) * deviations**3 * along
+    wider[:3, :3] += inwards @ inwards.T + back @ back.T
     return wider
 
 
@@ -98,66 +117,85 @@ def _is_wide(covariance: Floats) -> bool:
 
 @dataclass(frozen=True)
 class _Turns:
-    """The likelihood near a pose, a term of steps along axes, the first two of which turn it."""
+    """The likelihood near poses of B equal bodies, a term of steps along axes of each.
 
-    T_world_object: Floats
-    seen: Matches
-    roots: Floats  # (R,) of the weights of offsets, R = 2 L N
+    The first two axes turn the body.
+    """
+
+    poses: Floats  # (B, 4, 4)
+    observed: Floats  # (B, L, N, 2) places, σ_ε
+    roots: Floats  # (B, R) of the weights of offsets, R = 2 L N
     projection: BodyProjection
-    axes: Floats  # (6, k) twists of a standard deviation each
-    curvature: Floats  # (2, 2) of −2 ln p by the two turns at the pose, of noise that is known
+    sigmas: Floats  # (L, 1, 1) σ_ε in sensor units
+    axes: Floats  # (B, 6, k) twists of a standard deviation each
+    curvature: Floats  # (B, 2, 2) of −2 ln p by the two turns at the pose, of noise that is known
+    at_pose: Floats  # (B,) values of ln p
 
     @classmethod
-    def about(
-        cls,
-        covariance: Floats,
-        T_world_object: Floats,
-        seen: Matches,
-        variances: Floats,
-        projection: BodyProjection,
-        free: Mask,
-    ) -> _Turns | None:
-        """Choose axes by the turns that are least known; None if no turn is wide enough."""
-        inner = np.ix_(free, free)
-        scale = np.sqrt(np.maximum(covariance[inner].diagonal(), 1e-300))
-        values, vectors = np.linalg.eigh(covariance[inner] / np.outer(scale, scale))
-        deviations = np.zeros((6, len(scale)))
-        deviations[free] = scale[:, None] * vectors * np.sqrt(np.maximum(values, 1e-12))
-        _, turns, across = np.linalg.svd(deviations[3:])
-        if not turns[0] > _LEAST_TURN or len(scale) < 3:
-            return None
-        axes = deviations @ across.T
-        roots = np.sqrt(seen.shares / (variances[:, None] + seen.extra)).ravel().repeat(2)
-        J = roots[:, None] * (seen.J.reshape(-1, 6) @ axes)
-        H = J.T @ J
-        curvature = H[:2, :2] - H[:2, 2:] @ np.linalg.pinv(H[2:, 2:]) @ H[2:, :2]
-        return cls(T_world_object, seen, roots, projection, axes, curvature)
+    def about(cls, poses: Sequence[Curved], free: Mask) -> tuple[list[int], _Turns | None]:
+        """Choose axes by the turns that are least known, at poses where these are wide enough.
+
+        Returns the numbers of these poses, too; None where there are none.
+        """
+        covariances = np.array([pose.covariance for pose in poses])[:, free][..., free]
+        scales = np.sqrt(np.maximum(np.einsum("bkk->bk", covariances), 1e-300))
+        values, vectors = np.linalg.eigh(covariances / (scales[..., None] * scales[:, None]))
+        deviations = np.zeros((len(poses), 6, scales.shape[1]))
+        roots = np.sqrt(np.maximum(values, 1e-12))
+        deviations[:, free] = scales[..., None] * vectors * roots[:, None]
+        _, turns, across = np.linalg.svd(deviations[:, 3:])
+        wide = np.flatnonzero(turns[:, 0] > _LEAST_TURN).tolist() if scales.shape[1] > 2 else []
+        if not wide:
+            return wide, None
+        chosen = [poses[k] for k in wide]
+        axes = deviations[wide] @ across[wide].swapaxes(1, 2)
+        return wide, cls._along(axes, chosen)
+
+    @classmethod
+    def _along(cls, axes: Floats, poses: Sequence[Curved]) -> _Turns:
+        """Return the likelihood near poses by steps along axes (B, 6, k)."""
+        seen, B = [pose.seen for pose in poses], len(poses)
+        variances = np.array([pose.variances[:, None] + pose.seen.extra for pose in poses])
+        weights = np.array([matches.shares for matches in seen]) / variances
+        roots = np.sqrt(weights).reshape(B, -1).repeat(2, axis=1)
+        offsets = np.array([matches.offsets for matches in seen])
+        sigmas = seen[0].sigmas[:, None, None]
+        observed = np.array([matches.places for matches in seen]) / sigmas + offsets
+        J = roots[..., None] * (np.array([m.J for m in seen]).reshape(B, -1, 6) @ axes)
+        H = J.swapaxes(1, 2) @ J
+        turned, crossed = H[:, :2, :2], H[:, :2, 2:]
+        curvature = turned - crossed @ np.linalg.pinv(H[:, 2:, 2:]) @ crossed.swapaxes(1, 2)
+        at_pose = -0.5 * ((roots * offsets.reshape(B, -1)) ** 2).sum(axis=1)
+        T, projection = np.array([pose.T_world_object for pose in poses]), poses[0].projection
+        return cls(T, observed, roots, projection, sigmas, axes, curvature, at_pose)
 
     def fallen(self, turns: Floats) -> tuple[Floats, Floats]:
-        """Return the increase (K,) of −2 ln p at turns (K, 2), in deviations, and poses (K, 4, 4).
+        """Return the increase (B, K) of −2 ln p at turns (K, 2), in deviations, and poses there.
 
         It is scaled to the noise of the covariance, which is wider than that of the curvature.
+        Poses are (B, K, 4, 4).
         """
-        rest = np.arange(self.axes.shape[1]) > 1
-        begun = perturb(self.T_world_object, turns @ self.axes[:, :2].T)
-        ends = stepped(self, begun, lambda T, steps: perturb(T, steps @ self.axes.T), rest, _STEPS)
-        wide = np.linalg.norm(turns @ self.axes[3:, :2].T, axis=1) > _WIDEST_TURN
+        (B, _, count), K = self.axes.shape, len(turns)
+        twists = self.axes.swapaxes(1, 2)
+        begun = perturb(self.poses[:, None], turns @ twists[:, :2])
+
+        def moved(T: Floats, steps: Floats) -> Floats:
+            return perturb(T, (steps.reshape(B, K, count) @ twists).reshape(-1, 6))
+
+        ends = stepped(self, begun.reshape(-1, 4, 4), moved, np.arange(count) > 1, _STEPS)
+        wide = np.linalg.norm(turns @ twists[:, :2, 3:], axis=2) > _WIDEST_TURN
         # wide turns may be without curvature
         known = np.where(wide, np.inf, np.vecdot(turns @ self.curvature, turns))
-        fallen = 2 * (self._at_pose - ends.values) * (np.vecdot(turns, turns) / known)
-        return np.where(wide, np.inf, fallen), ends.states
-
-    @cached_property
-    def _at_pose(self) -> float:
-        """Value of ln p at the pose."""
-        return -0.5 * float(np.sum((self.roots * self.seen.offsets.ravel()) ** 2))
+        values = ends.values.reshape(B, K)
+        fallen = 2 * (self.at_pose[:, None] - values) * (np.vecdot(turns, turns) / known)
+        return np.where(wide, np.inf, fallen), ends.states.reshape(B, K, 4, 4)
 
     def linearise(self, states: Floats) -> Quadratic:
-        """Return models of ln p at poses (K, 4, 4), by the detections that the pose meets."""
-        match, seen = self.projection.project(states), self.seen
-        sigmas = seen.sigmas[:, None, None]
-        r = (seen.places - match.y.swapaxes(0, 1)) / sigmas + seen.offsets
-        J = (match.J.swapaxes(0, 1) / sigmas[..., None]).reshape(len(states), -1, 6)
-        return squares_of(
-            self.roots * r.reshape(len(states), -1), self.roots[:, None] * (J @ self.axes)
-        )
+        """Return models of ln p at poses (B K, 4, 4), by the detections that each pose meets."""
+        match, (B, rows) = self.projection.project(states), self.roots.shape
+        y, J = (of_sensors.swapaxes(0, 1) for of_sensors in (match.y, match.J))
+        r = self.observed[:, None] - (y / self.sigmas).reshape(B, -1, *self.observed.shape[1:])
+        r = self.roots[:, None] * r.reshape(B, -1, rows)
+        J = (J / self.sigmas[..., None]).reshape(B, -1, 6) @ self.axes
+        J = self.roots[:, None, :, None] * J.reshape(B, -1, rows, J.shape[2])
+        return squares_of(r.reshape(-1, rows), J.reshape(-1, *J.shape[2:]))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -20,7 +20,7 @@ from scipy.special import fdtri
 
 from mixpose.constants import constant
 from mixpose.density import DRAWING
-from mixpose.records import Floats, Indices, Mask
+from mixpose.records import Floats, Indices, Mask, replace
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ Where features overlap it is Gauss-Newton's of the residual g − a h,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -37,7 +37,7 @@ from mixpose.density import (
 )
 from mixpose.objective.projection import BodyProjection, Match, View, project_body
 from mixpose.optimise import Quadratic
-from mixpose.records import Floats, Indices, Mask
+from mixpose.records import Floats, Indices, Mask, replace
 
 _NONE = np.finfo(np.float64).tiny  # ⟨h, h⟩ of a sensor that sees no feature
 STEPS_PER_SIGMA, FINE_STEPS = DRAWING.steps_per_sigma, DRAWING.fine_steps

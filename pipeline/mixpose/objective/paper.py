@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, TypeAlias, get_args
 
@@ -21,7 +21,7 @@ from mixpose.density import DRAWING, Density, remap
 from mixpose.objective.matched import MatchedObjective, matched_objective
 from mixpose.objective.projection import View, pose_jacobian
 from mixpose.optimise import Quadratic
-from mixpose.records import Floats, Singles
+from mixpose.records import Floats, Singles, replace
 from mixpose.rigid import transform
 from mixpose.sensors import AffineSensor, Sensor
 

@@ -14,13 +14,13 @@ Gauss-Newton's of the residual g − Σ_i α_i h_i with α solved for (variable 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from mixpose.objective.matched import MatchedObjective
 from mixpose.optimise import Quadratic, Sum, Term
-from mixpose.records import Floats, Mask
+from mixpose.records import Floats, Mask, replace
 from mixpose.rigid import perturb, twist_between
 
 

@@ -18,7 +18,7 @@ from scipy.spatial.distance import cdist
 
 from mixpose.body import Body
 from mixpose.records import Floats, Indices, Mask
-from mixpose.rigid import transform
+from mixpose.rigid import cross, transform
 from mixpose.search.problem import THOROUGH, SearchBudget, SearchProblem
 from mixpose.search.three_points import (
     FIRST,
@@ -89,7 +89,7 @@ def _meetings(
     step = max(_AT_ONCE // max(len(b), 1), 1)
     ones = np.ones((len(b), 1))
     origins_b = b.origins - a.origins[:1].sum(axis=0)  # near zero, as products would lose digits
-    moments_b = np.hstack([np.cross(b.directions, origins_b), -b.directions])
+    moments_b = np.hstack([cross(b.directions.T, origins_b.T).T, -b.directions])
     along_b = np.hstack([(origins_b * b.directions).sum(axis=1, keepdims=True), -b.directions])
     for start in range(0, max(len(a), 1), step):
         u = a.directions[start : start + step]
@@ -100,7 +100,7 @@ def _meetings(
         to_b = np.hstack([np.ones((len(o), 1)), o]) @ along_b.T
         s = (to_a - cosine * to_b) / sine2
         t = (cosine * to_a - to_b) / sine2
-        gap = np.abs(np.hstack([u, np.cross(o, u)]) @ moments_b.T) / np.sqrt(sine2)
+        gap = np.abs(np.hstack([u, cross(o.T, u.T).T]) @ moments_b.T) / np.sqrt(sine2)
         tolerance = np.hypot(
             gates[0] * (a.offset + a.slope * np.abs(s)), gates[1] * (b.offset + b.slope * np.abs(t))
         )

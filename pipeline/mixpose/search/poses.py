@@ -24,7 +24,7 @@ from mixpose.matching import Matches, crowding, owners_of
 from mixpose.objective import MatchedObjective, View, matched_objective, project_body
 from mixpose.optimise import Quadratic, Sum, squares_of, stepped
 from mixpose.records import Floats, Indices, Mask
-from mixpose.rigid import from_parts, perturb, transform
+from mixpose.rigid import cross, from_parts, perturb, transform
 from mixpose.search.problem import SearchBudget, SearchProblem, SensorDetections
 from mixpose.sensors import Rays, clouds_among, from_planes
 
@@ -43,9 +43,9 @@ def label_image(sensor: SensorDetections, rays: Rays, reach: float) -> LabelImag
     """Draw the detections of a camera as disks of radius `reach` in px."""
     middle = rays.directions.mean(axis=0)
     middle /= np.linalg.norm(middle)
-    side = np.cross(middle, np.eye(3)[np.abs(middle).argmin()])
+    side = cross(middle, np.eye(3)[np.abs(middle).argmin()])
     side /= np.linalg.norm(side)
-    axes, centre = np.array([side, np.cross(middle, side), middle]), rays.origins[0]
+    axes, centre = np.array([side, cross(middle, side), middle]), rays.origins[0]
     to_plane, eye = np.column_stack([axes, -axes @ centre]), np.append(centre, 1.0)
     if not rays.central:
         to_plane[2], eye = [0.0, 0.0, 0.0, 1.0], np.append(-middle, 0.0)

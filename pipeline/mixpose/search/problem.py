@@ -6,7 +6,7 @@ Reasons quote rows of `tools/benchmark.py search` as features/hidden/false detec
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
@@ -17,7 +17,7 @@ from mixpose.constants import constant
 from mixpose.density import Observation
 from mixpose.judgement import JudgementRules
 from mixpose.objective import View
-from mixpose.records import Floats, GridPattern, Mask, PointPattern, Singles
+from mixpose.records import Floats, GridPattern, Mask, PointPattern, Singles, replace
 from mixpose.rigid import perturb, twist_between
 from mixpose.sensors import Rays
 

@@ -7,7 +7,7 @@ out of its density, so that they do not pull, and out of the clutter of its evid
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import TypeAlias
 
@@ -17,7 +17,7 @@ from scipy.spatial.distance import cdist
 from mixpose.body import Body
 from mixpose.judgement import ScoredPose
 from mixpose.objective import View, project_body
-from mixpose.records import Floats, Indices, Mask
+from mixpose.records import Floats, Indices, Mask, replace
 from mixpose.sensors import clouds_among
 from mixpose.tracking.rules import SceneRules
 

@@ -6,13 +6,12 @@ A cloud is seen in three images (`mixpose.sensors.cloud`), each of them a view.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from mixpose.objective import View
-from mixpose.records import Estimate, Floats, Offsets, PointPattern, SensorReport
+from mixpose.records import Estimate, Floats, Offsets, PointPattern, SensorReport, replace
 from mixpose.sensors import PLANES, CloudSensor
 
 

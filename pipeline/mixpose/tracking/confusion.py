@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import cache, partial
 from itertools import permutations, product
 from typing import NamedTuple
@@ -21,7 +20,7 @@ from mixpose.body import FEWEST, LookAlike, like_features, of_size, tolerance_of
 from mixpose.fit import Fit
 from mixpose.judgement import Alternative, ScoredPose, Verdict
 from mixpose.objective import project_body
-from mixpose.records import Floats
+from mixpose.records import Floats, replace
 from mixpose.search import is_pointlike
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of

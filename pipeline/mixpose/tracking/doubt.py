@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import combinations
 
@@ -35,7 +34,7 @@ from mixpose.judgement import (
     possible_mistakes,
     shape_shown,
 )
-from mixpose.records import Floats, Mask
+from mixpose.records import Floats, Mask, replace
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, depth_reversed, is_flat, mirror_odds

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from mixpose.judgement import nearest_alike
-from mixpose.records import Floats
+from mixpose.records import Floats, replace
 from mixpose.rigid import inverse, perturb, twist_between
 from mixpose.tracking.frame import Frame
 from mixpose.tracking.motion import MotionFilter, RandomWalk, per_kind

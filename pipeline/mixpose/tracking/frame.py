@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, reduce
 from typing import Any
 
@@ -23,13 +23,13 @@ from mixpose.judgement import (
 )
 from mixpose.matching import Matches, NoiseEstimate, log_likelihood, pooled
 from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
-from mixpose.records import Floats, Mask
+from mixpose.records import Floats, Mask, replace
 from mixpose.rigid import transform, twist_between
 from mixpose.search import SearchReport, SearchState
 from mixpose.sensors import Motion, in_motion
 from mixpose.tracking.motion import ExpectedVelocity, at_rest
 from mixpose.tracking.rules import Rules
-from mixpose.tracking.track import Branch, Track, mixed_prior
+from mixpose.tracking.track import Branch, Track, log_densities, mixed_prior, places_of
 
 
 @dataclass(frozen=True)
@@ -217,23 +217,11 @@ class Frame(Setup):
 
     def log_densities(self, poses: Floats) -> Floats:
         """Return log densities (K,) of poses (K, 4, 4) by the predictions, or elsewhere."""
-        logs = np.full(len(poses), self.elsewhere)
-        surprise = self.rules.motion.surprise_after(self.track.misses)
-        for branch in self.predictions:
-            nearest = nearest_alike(poses, self.body, branch.T_world_object)
-            near = branch.log_density(nearest, self.free, self.rules.motion)
-            logs = np.logaddexp(logs, branch.log_belief(surprise) + near)
-        return logs
+        return np.asarray(log_densities_by([self], poses)[0])
 
     def gains(self, poses: Floats) -> Floats:
-        """Return how much likelier (K,) the track makes poses (K, 4, 4) than a flat prior.
-
-        Zeros where the track may follow another body: then it does not tell the two apart.
-        """
-        doubt = max(self.track.confused.values(), default=-math.inf)
-        if doubt > self.rules.acceptance.log_doubt:
-            return np.zeros(len(poses))
-        return self.log_densities(poses) - self.flat_prior[0]
+        """Return how much likelier (K,) the track makes poses (K, 4, 4) than a flat prior."""
+        return np.asarray(gains_by([self], poses)[0])
 
     def feature_distances(self, T_world_object: Floats) -> list[Floats]:
         """Return how far the features (N,) of each prediction are from those at a pose.
@@ -331,6 +319,33 @@ class Frame(Setup):
         if branch.motion_filter is None or elapsed > rules.longest_s:
             return resting
         return branch.motion_filter.expected(moved if seen else None, elapsed)
+
+
+def log_densities_by(frames: Sequence[Frame], poses: Floats) -> Floats:
+    """Return log densities (F, K) of poses (K, 4, 4) of one body by what each frame expects."""
+    logs = np.array([frame.elsewhere for frame in frames])[:, None].repeat(len(poses), axis=1)
+    rows = [k for k, frame in enumerate(frames) for _ in frame.predictions]
+    if not rows:
+        return logs
+    branches = [branch for frame in frames for branch in frame.predictions]
+    body, free, rules = frames[0].body, frames[0].free, frames[0].rules.motion
+    nearest = nearest_alike(poses, body, places_of(branches))
+    near = log_densities(branches, np.broadcast_to(nearest, (len(rows), *poses.shape)), free, rules)
+    for k, branch, logs_near in zip(rows, branches, near, strict=True):
+        surprise = rules.surprise_after(frames[k].track.misses)
+        logs[k] = np.logaddexp(logs[k], branch.log_belief(surprise) + logs_near)
+    return logs
+
+
+def gains_by(frames: Sequence[Frame], poses: Floats) -> Floats:
+    """Return how much likelier (F, K) frames make poses (K, 4, 4) of one body than a flat prior.
+
+    Zeros where the track may follow another body: then it does not tell the two apart.
+    """
+    gains = log_densities_by(frames, poses) - frames[0].flat_prior[0]
+    doubts = [max(frame.track.confused.values(), default=-math.inf) for frame in frames]
+    gains[np.array(doubts) > frames[0].rules.acceptance.log_doubt] = 0.0
+    return np.asarray(gains)
 
 
 def spread_in_image(frame: Frame, T_world_object: Floats) -> float:

@@ -25,6 +25,7 @@ from scipy.optimize import linear_sum_assignment
 
 from mixpose.judgement import ScoredPose
 from mixpose.records import Floats, Indices
+from mixpose.tracking.frame import log_densities_by
 from mixpose.tracking.motion import Distances
 from mixpose.tracking.sharing import Explanation
 
@@ -94,11 +95,11 @@ def identify(
     # by body (rows) and pose; the last column is for no pose, as when a body in view is missed
     rules, rows = frames[0].rules, list[list[float]]()
     transforms = np.reshape([pose.T_world_object for pose in poses], (-1, 4, 4))
-    for frame in frames:
+    for frame, log_densities in zip(frames, log_densities_by(frames, transforms), strict=True):
         hidden = 0.5 if frame.track.misses else rules.motion.hidden
         # a body never seen so far is as seldom in view as another one is somewhere else
         hidden = hidden if frame.predictions else 1 - rules.motion.surprise
-        logs = math.log1p(-hidden) + frame.log_densities(transforms)
+        logs = math.log1p(-hidden) + log_densities
         rows.append([*logs.tolist(), math.log(hidden)])
     places = np.array([*(pose.T_world_object[:3, 3] for pose in poses), np.full(3, np.nan)])
     assignment = Assignment(

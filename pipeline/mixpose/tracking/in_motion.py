@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +20,7 @@ from mixpose.judgement import ScoredPose, inverted
 from mixpose.matching import LEAST_VARIANCE, Matches, associate, errors_seen, welsch
 from mixpose.objective import View
 from mixpose.optimise import LinearResiduals, least_squares
-from mixpose.records import Floats, Indices, Mask
+from mixpose.records import Floats, Indices, Mask, replace
 from mixpose.rigid import perturb
 from mixpose.sensors import Motion, read_times
 from mixpose.tracking.frame import Frame

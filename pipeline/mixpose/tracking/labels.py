@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.density import Observation
-from mixpose.records import Estimate, Floats, Label, MeasuredPoint, Offsets
+from mixpose.records import Estimate, Floats, Label, MeasuredPoint, Offsets, replace
 from mixpose.rigid import transform
 
 

@@ -6,14 +6,13 @@ Of matched densities or, for single ranges of small bodies, see `mixpose.trackin
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from typing import TypeAlias
 
 from mixpose.fit import Fit, fit_near
 from mixpose.judgement import Case, ScoredPose, judge_together
 from mixpose.matching import Matches
 from mixpose.optimise import Ascent
-from mixpose.records import Floats
+from mixpose.records import Floats, replace
 from mixpose.sensors import Motion
 from mixpose.tracking.frame import Frame, Start, spread_in_image
 from mixpose.tracking.in_motion import fit_in_motion, matches_at, with_motion_unknown

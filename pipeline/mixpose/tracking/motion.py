@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import NamedTuple, TypeAlias
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.records import Floats
+from mixpose.records import Floats, replace
 from mixpose.rigid import cross
 from mixpose.sensors import Motion
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from mixpose.body import Body
 from mixpose.errors import SessionError
-from mixpose.records import Estimate, Floats
+from mixpose.records import Estimate, Floats, replace
 from mixpose.rigid import perturb, twist_between
 from mixpose.tracking.motion import MotionFilter, MotionRules
 

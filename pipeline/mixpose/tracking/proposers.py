@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import product
 from operator import add
@@ -20,7 +19,7 @@ from mixpose.body import LookAlike, like_features, other_tilt, thickness, tolera
 from mixpose.density import DRAWING
 from mixpose.fit import blur_schedule, widest_blurs
 from mixpose.judgement import ScoredPose, is_sure
-from mixpose.records import Floats, Mask
+from mixpose.records import Floats, Mask, replace
 from mixpose.rigid import perturb, transform
 from mixpose.search import (
     Candidate,

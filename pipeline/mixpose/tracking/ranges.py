@@ -14,7 +14,7 @@ may make likely are followed.  What the best leaves unexplained counts for one n
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import compress
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ from mixpose.judgement import DetectionModel, ScoredPose, judge, nearest_alike
 from mixpose.matching import Matches
 from mixpose.objective import NormalPrior, View, project_body
 from mixpose.optimise import NewtonOptions, Quadratic, Sum, ascend
-from mixpose.records import Floats, PointPattern
+from mixpose.records import Floats, PointPattern, replace
 from mixpose.rigid import perturb
 from mixpose.search import distinct_poses, is_pointlike
 from mixpose.tracking.frame import Frame, Start

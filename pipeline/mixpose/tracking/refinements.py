@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
 from itertools import combinations
 from typing import TypeAlias
 
@@ -19,7 +18,7 @@ from mixpose.fit import Fit, FitRules
 from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose, inverted
 from mixpose.matching import LEAST_VARIANCE, ErrorRules, Matches, log_likelihood, welsch
 from mixpose.optimise import LinearResiduals, least_squares
-from mixpose.records import Floats, Indices, Mask
+from mixpose.records import Floats, Indices, Mask, replace
 from mixpose.rigid import perturb
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import Likelihood, met_at

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.judgement import ScoredPose, with_likely_turns, with_wide_turn
+from mixpose.judgement import Curved, ScoredPose, with_likely_turns, with_wide_turn
 from mixpose.matching import Matches
 from mixpose.objective import project_body
 from mixpose.records import Floats, Offsets
@@ -14,15 +16,29 @@ from mixpose.search import is_pointlike
 from mixpose.tracking.frame import Frame
 
 
-def reported_covariance(data: Frame, pose: ScoredPose, origin: Floats) -> Floats:
-    """Return the covariance (6, 6) of a pose at a point (3,) of the body, with all likely turns."""
-    T, covariance = pose.T_world_object, pose.covariance
-    if pose.spread is None and is_pointlike(data.body):
-        sensors = tuple([view.sensor for view in data.views if view.name not in pose.left_out])
-        arguments = T, pose.used, pose.variances, project_body(sensors, data.body), data.free
-        covariance = with_likely_turns(covariance, *arguments)
-    covariance = covariance_at(covariance, T[:3, :3] @ origin)
-    return with_wide_turn(covariance, T, data.body.means - origin)
+def reported_covariances(
+    poses: Sequence[tuple[Frame, ScoredPose | None, Floats]],
+) -> list[Floats | None]:
+    """Return covariances (6, 6) at points (3,) of bodies, with all likely turns; None of no pose.
+
+    The bodies have the same free directions.
+    """
+    curved = dict[int, Curved]()
+    for k, (data, pose, _) in enumerate(poses):
+        if pose is not None and pose.spread is None and is_pointlike(data.body):
+            sensors = tuple([view.sensor for view in data.views if view.name not in pose.left_out])
+            at = pose.covariance, pose.T_world_object, pose.used, pose.variances
+            curved[k] = Curved(*at, project_body(sensors, data.body))
+    turned = dict(zip(curved, with_likely_turns([*curved.values()], poses[0][0].free), strict=True))
+    covariances = list[Floats | None]()
+    for k, (data, pose, origin) in enumerate(poses):
+        if pose is None:
+            covariances.append(None)
+            continue
+        T, points = pose.T_world_object, data.body.means - origin
+        covariance = covariance_at(turned.get(k, pose.covariance), T[:3, :3] @ origin)
+        covariances.append(with_wide_turn(covariance, T, points))
+    return covariances
 
 
 def residuals_of(used: Matches, body: Body) -> dict[str, dict[str, float | None]]:

@@ -15,13 +15,12 @@ sessions that are mistaken so.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
 from mixpose.judgement import LEAST_BELIEF, ScoredPose, ahead, odds_of
 from mixpose.matching import Matches
-from mixpose.records import Floats
+from mixpose.records import Floats, replace
 from mixpose.tracking.frame import Frame
 from mixpose.tracking.track import Branch
 

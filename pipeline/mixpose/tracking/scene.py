@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import permutations
 from operator import itemgetter
@@ -26,7 +26,7 @@ from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.judgement import Alternative, Verdict
 from mixpose.objective import View, project_body
-from mixpose.records import Estimate, Floats, Mask
+from mixpose.records import Estimate, Floats, Mask, replace
 from mixpose.rigid import transform
 from mixpose.sensors import Sensor
 from mixpose.tracking.confusion import confusions_of
@@ -34,6 +34,7 @@ from mixpose.tracking.frame import Frame
 from mixpose.tracking.identity import Rivals, identify
 from mixpose.tracking.mirrors import is_flat
 from mixpose.tracking.motion import Distances
+from mixpose.tracking.reporting import reported_covariances
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.sharing import Explanation, Sharing
 from mixpose.tracking.track import Branch, Companion, Track, likely_branches
@@ -80,8 +81,8 @@ class Scene:
         reported = {k: _in_doubt(chosen[k].verdict, rivals.get(k, [])) for k in chosen}
         frames = {k: _seen_by(own.frame, chosen[k].frame) for k, own in explained.items()}
         confusions = confusions_of(frames, reported)
-        after, estimates = list[Track](), list[Estimate]()
-        for k, tracked in enumerate(self.bodies):
+        after = list[Track]()
+        for k in range(len(self.bodies)):
             data, verdict = frames[k], chosen[k].verdict
             odds = data.track.confused
             if k in confusions:
@@ -89,7 +90,11 @@ class Scene:
                 odds = dict(sorted(against, key=itemgetter(1)))
                 verdict, reported[k] = verdict.doubted(against), reported[k].doubted(against)
             after.append(replace(track_after(data, verdict), distances=apart.get(k), confused=odds))
-            estimates.append(tracked.estimate(data, after[k], reported[k], chosen[k].ranked))
+        shown = [(frames[k], reported[k].best, own.origin) for k, own in enumerate(self.bodies)]
+        estimates = [
+            tracked.estimate(frames[k], after[k], reported[k], chosen[k].ranked, covariance)
+            for (k, tracked), covariance in zip(enumerate(self.bodies), reported_covariances(shown))
+        ]
         return self._with_companions(after, reported), estimates
 
     def _with_companions(

@@ -8,7 +8,7 @@ session file, claims its detections, and bodies that had met any of these are so
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -20,11 +20,11 @@ from mixpose.fit import Fit, fit_together
 from mixpose.judgement import Case, ScoredPose, Verdict, insert, is_possible, judge_together
 from mixpose.objective import SharedDensities, View, has_bare_points, matched_objective
 from mixpose.optimise import Ascent
-from mixpose.records import Floats, Mask
+from mixpose.records import Floats, Mask, replace
 from mixpose.search import SeenTogether, search_copies
 from mixpose.tracking.claims import Claims, Met
 from mixpose.tracking.doubt import decide_frame
-from mixpose.tracking.frame import Frame, Start
+from mixpose.tracking.frame import Frame, Start, gains_by, log_densities_by
 from mixpose.tracking.likelihood import MatchedLikelihood, case_of, likelihood_of
 from mixpose.tracking.proposers import is_convincing, predicted
 from mixpose.tracking.rules import SceneRules
@@ -121,7 +121,7 @@ class Sharing:
 
         def gain(kind: int, poses: Floats) -> Floats:
             """Return the gain (K,) of poses by the likeliest of identical bodies."""
-            return np.asarray(np.max([data[k].gains(poses) for k in groups[kind]], axis=0))
+            return np.asarray(gains_by([data[k] for k in groups[kind]], poses).max(axis=0))
 
         copies = search_copies(leftover, bodies, kinds[0].free, gain)
         starts = dict[int, Starts]()
@@ -130,7 +130,7 @@ class Sharing:
             frames = [data[k] for k in group]
             evidence = np.array([copy.evidence for copy in candidates])
             poses = np.reshape([copy.T_world_object for copy in candidates], (-1, 4, 4))
-            likely = np.array([evidence + frame.log_densities(poses) for frame in frames])
+            likely = evidence + log_densities_by(frames, poses)
             for i, j in zip(*linear_sum_assignment(likely, maximize=True), strict=True):
                 copy, wide = candidates[j], frames[i].close_uncertainty
                 both = copy.T_world_object, copy.rival

@@ -15,7 +15,7 @@ frames; before the first nothing is known.  Configured radii of markers are fact
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -25,7 +25,7 @@ from mixpose.constants import constant
 from mixpose.density import DRAWING
 from mixpose.judgement import ScoredPose
 from mixpose.objective import View, project_body
-from mixpose.records import Floats, Indices, Mask, PointPattern
+from mixpose.records import Floats, Indices, Mask, PointPattern, replace
 from mixpose.rigid import cross
 
 _TINY = float(np.finfo(np.float64).tiny)
@@ -89,13 +89,14 @@ class Sizes:
             self if self.count else Sizes(0.0, float(np.median(np.concatenate([*logs.values()]))))
         )
         # in a new sensor most spots are assumed to be whole
-        first = {name: (float(v.size), float(np.median(v))) for name, v in logs.items()}
+        new = {name: v for name, v in logs.items() if name not in known.sensors}
+        first = {name: (float(v.size), float(np.median(v))) for name, v in new.items()}
         known = replace(known, sensors=first | dict(known.sensors))
         sensors = {name: (rules.memory * n, mean) for name, (n, mean) in self.sensors.items()}
         count, squares = rules.memory * self.count, rules.memory * self.squares
         for (name, values), centre in zip(logs.items(), known.centres([*logs], rules), strict=True):
             weights = 1 - known.cut(values - centre, rules)
-            before, mean = sensors.get(name, (0.0, first[name][1]))
+            before, mean = sensors[name] if name in sensors else (0.0, first[name][1])
             after = before + float(weights.sum())
             mean += float(weights @ (values - mean)) / max(after, 1e-12)
             sensors[name] = after, mean

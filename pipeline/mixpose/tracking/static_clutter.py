@@ -6,14 +6,14 @@ What is static, as lamps are, is searched last: a body that stands still is only
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from mixpose.density import Observation
 from mixpose.objective import View
-from mixpose.records import Floats, Indices, Mask
+from mixpose.records import Floats, Indices, Mask, replace
 from mixpose.sensors import clouds_among
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.special import gammaln
@@ -22,7 +22,7 @@ from mixpose.judgement import (
     nearest_alike,
 )
 from mixpose.objective import View
-from mixpose.records import DelayEstimate, Floats, Mask
+from mixpose.records import DelayEstimate, Floats, Mask, replace
 from mixpose.rigid import inverse, perturb, twist_between
 from mixpose.search import SearchState
 from mixpose.tracking.motion import Distances, MotionFilter, MotionRules, RandomWalk, per_kind
@@ -60,16 +60,49 @@ class Branch:
     def log_density(self, T_world_object: Floats, free: Mask, rules: MotionRules) -> Floats:
         """Return log densities of poses (..., 4, 4) by this prediction, in the free directions."""
         twists = twist_between(self.T_world_object, T_world_object)
+        if self.spread is None:
+            return _log_students(twists, self.uncertainty, free, rules)
         off = np.divide(twists, self.uncertainty, out=np.zeros(twists.shape), where=free)
-        squares = (off.reshape(*off.shape[:-1], 2, 3) ** 2).sum(axis=-1)  # of shifts and of turns
-        count, volume = int(free.sum()), float(np.log(self.uncertainty[free]).sum())
-        if self.spread is not None:
-            return np.asarray(self.log_peak(free) - 0.5 * squares.sum(axis=-1))
-        # an uncertainty from a step or two, alike in directions of a kind, makes errors Student's
-        n, p = rules.known_from, free.reshape(2, 3).sum(axis=1)
-        peak = float((gammaln((n + p) / 2) - gammaln(n / 2)).sum())
-        tails = 0.5 * np.log1p(squares / n) @ (n + p)
-        return np.asarray(peak - 0.5 * count * math.log(n * math.pi) - tails - volume)
+        return np.asarray(self.log_peak(free) - 0.5 * np.vecdot(off, off))
+
+
+def log_densities(
+    branches: Sequence[Branch], poses: Floats, free: Mask, rules: MotionRules
+) -> Floats:
+    """Return log densities (B, K) of poses (B, K, 4, 4) by predictions, as `Branch.log_density`."""
+    if not branches or any(branch.spread is not None for branch in branches):
+        logs = [branch.log_density(T, free, rules) for branch, T in zip(branches, poses)]
+        return np.reshape(logs, poses.shape[:2])
+    uncertainties = np.array([branch.uncertainty for branch in branches])[:, None]
+    return _log_students(twist_between(places_of(branches), poses), uncertainties, free, rules)
+
+
+def places_of(branches: Sequence[Branch]) -> Floats:
+    """Return the poses of predictions (B, 1, 4, 4)."""
+    return np.reshape([branch.T_world_object for branch in branches], (-1, 1, 4, 4))
+
+
+def _log_students(twists: Floats, uncertainty: Floats, free: Mask, rules: MotionRules) -> Floats:
+    """Return log densities of twists (..., 6) by uncertainties (..., 6), of Student's kind.
+
+    An uncertainty from a step or two, alike in directions of a kind, makes errors Student's.
+    """
+    off = np.divide(twists, uncertainty, out=np.zeros(twists.shape), where=free)
+    off = off.reshape(*off.shape[:-1], 2, 3)  # of shifts and of turns
+    exponents, peak = _student(tuple(free.tolist()), rules.known_from)
+    tails = np.log1p(np.vecdot(off, off) / rules.known_from) @ exponents
+    return np.asarray(peak - tails - np.log(uncertainty[..., free]).sum(axis=-1))
+
+
+@lru_cache(maxsize=16)
+def _student(free: tuple[bool, ...], n: float) -> tuple[Floats, float]:
+    """Return exponents (2,) of Student's densities of n degrees of freedom, and their log peak.
+
+    One is of shifts and one of turns, in as many directions as are `free`.
+    """
+    p = np.array([sum(free[:3]), sum(free[3:])])
+    peak = float((gammaln((n + p) / 2) - gammaln(n / 2)).sum())
+    return 0.5 * (n + p), peak - 0.5 * sum(free) * math.log(n * math.pi)
 
 
 def likely_branches(branches: Sequence[Branch], confidence: float) -> list[Branch]:

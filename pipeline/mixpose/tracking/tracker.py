@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
 
@@ -16,7 +16,7 @@ from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, Fit, free_mask
 from mixpose.judgement import APART, ClutterRates, ScoredPose, Verdict, insert
 from mixpose.objective import View
-from mixpose.records import Estimate, Floats, Hypothesis, SensorReport, label_of
+from mixpose.records import Estimate, Floats, Hypothesis, SensorReport, label_of, replace
 from mixpose.rigid import from_parts
 from mixpose.search import is_pointlike
 from mixpose.threads import one_blas_thread
@@ -36,7 +36,7 @@ from mixpose.tracking.proposers import (
     searched,
 )
 from mixpose.tracking.refinements import REFINEMENTS, Refinement
-from mixpose.tracking.reporting import offsets_of, reported_covariance, residuals_of
+from mixpose.tracking.reporting import offsets_of, reported_covariances, residuals_of
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.sizes import are_cut_otherwise, sizes_after, weighed_by_size
 from mixpose.tracking.track import Branch, Track, predict
@@ -140,7 +140,8 @@ class Tracker(Setup):
         if verdict.best is not None and is_ok_but_for_mirrors(verdict):
             verdict = with_second(verdict, data, leftover_of(verdict.best, data))
         after = track_after(data, verdict)
-        return after, self.estimate(data, after, verdict, ranked)
+        (covariance,) = reported_covariances([(data, verdict.best, self.origin)])
+        return after, self.estimate(data, after, verdict, ranked, covariance)
 
     def predictions(self, track: Track, frame: int, time_s: float | None) -> list[Branch]:
         """Return where the track expects the body in a frame."""
@@ -209,7 +210,12 @@ class Tracker(Setup):
         return again if is_better or not data.track.sizes.count else ranked
 
     def estimate(
-        self, data: Frame, after: Track, verdict: Verdict, ranked: Sequence[ScoredPose]
+        self,
+        data: Frame,
+        after: Track,
+        verdict: Verdict,
+        ranked: Sequence[ScoredPose],
+        covariance: Floats | None,
     ) -> Estimate:
         """Return the estimate of a frame; reports are those of the first pose, believed or not."""
         body, best, T_origin = self.body, verdict.best, self._T_body_origin
@@ -227,7 +233,7 @@ class Tracker(Setup):
             object=body.name,
             status=verdict.status,
             T_world_object=best.T_world_object @ T_origin if best else None,
-            covariance=reported_covariance(data, best, self.origin) if best else None,
+            covariance=covariance,
             score=shown.score if shown else 0.0,
             confidence=verdict.confidence,
             sensors=reports,

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 from scipy.special import expit, logit
@@ -24,6 +23,7 @@ from mixpose.judgement import (
 )
 from mixpose.matching import log_likelihood
 from mixpose.objective import View
+from mixpose.records import replace
 from mixpose.search import Candidate, Copy, SeenTogether
 from mixpose.tracking.doubt import TWICE, contradicted, decide_frame
 from mixpose.tracking.frame import Frame, Start
