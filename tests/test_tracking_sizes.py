@@ -228,3 +228,33 @@ def test_a_body_that_is_far_from_where_it_was_expected_is_weighed_where_it_is(
         assert alone.covariance is not None
         # frames before tell how exact spots are, which makes it narrower
         assert np.trace(estimate.covariance[:3, :3]) < 2 * np.trace(alone.covariance[:3, :3])
+
+
+def test_spots_that_all_change_alike_are_whole_and_those_that_are_cut_are_not() -> None:
+    rng, sizes = np.random.default_rng(0), Sizes()
+    for _ in range(20):
+        sizes = sizes.followed({"0": np.log(RADIUS) + rng.normal(0, 0.02, 6)}, RULES)
+    (centre,) = sizes.centres(["0"], RULES)
+    brighter = centre + 0.3 + rng.normal(0, 0.02, 6)
+    assert sizes.centre_now(brighter, centre, RULES) == pytest.approx(centre + 0.3, abs=0.03)
+    # whole ones beside cut ones, cut ones alone, and one that may be anything
+    for others in ([0.0, 0.01, -0.3, -0.31, 0.02], [-0.2, -0.5, -0.9, -0.33, -0.7], [-0.3]):
+        assert sizes.centre_now(centre + np.array(others), centre, RULES) == centre
+
+
+@pytest.mark.parametrize("changed", [(0,), (0, 1)])
+def test_where_light_or_exposure_changes_frames_stay_ok(
+    pinhole_cameras: list[PinholeCamera], changed: tuple[int, ...]
+) -> None:
+    rng, tracker = np.random.default_rng(0), Tracker.create(BODY, EstimatorOptions())
+    track = tracker.begin()
+    for frame in range(16):
+        views = seen(pinhole_cameras, rng)
+        for k in changed if frame >= 8 else ():
+            pattern = views[k].observation.pattern
+            assert isinstance(pattern, PointPattern)
+            assert pattern.radii is not None
+            larger = replace(pattern, radii=1.3 * pattern.radii)
+            views[k] = replace(views[k], observation=Observation(larger, 1.5))
+        track, estimate = tracker.advance(track, frame, None, views)
+        assert estimate.status == "ok"

@@ -96,6 +96,22 @@ MUTANTS = (
         ("test_learn.py",),
     ),
     Mutant(
+        "tracking-mirror-images-have-their-depth",
+        "tracking/doubt.py",
+        "near = max(near, _log_odds_from_afar(data, judged, near_plane))",
+        "pass",
+        "one camera sees a mirrored body from afar, and it is ok a quarter of a metre off",
+        ("test_tracking_reflection.py",),
+    ),
+    Mutant(
+        "tracking-mirror-images-go-on-from-the-body",
+        "tracking/doubt.py",
+        "return alone if is_known else alone.changed(track=Track())",
+        "return data",
+        "what was followed is likelier than its mirror image, which was not",
+        ("test_tracking_reflection.py",),
+    ),
+    Mutant(
         "tracking-contradictions-are-forgotten",
         "tracking/doubt.py",
         "before = track.log_odds_mistaken(CONTRADICTION)",

@@ -293,7 +293,7 @@ def _log_odds_reflected(data: Frame, judged: ScoredPose, is_asked: bool, before:
             rival = data.rival(judged, T, data.close_uncertainty, ahead=likely)
             starts = [rival, *([Start(T)] if is_asked else [])]
             near = max([_evidence(mirror_frame, start) for start in starts]) - body_evidence
-            if is_asked and not data.static_views:  # at rest, moving bodies meet nothing
+            if is_asked and not data.is_timed:  # at rest, late sensors meet moving bodies elsewhere
                 near = max(near, _log_odds_from_afar(data, judged, near_plane))
             if near > likely:
                 return near

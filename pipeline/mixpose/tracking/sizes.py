@@ -43,6 +43,9 @@ class SizeRules:
     least: float = constant(0.01, "τ at least: disks of 6 px are as exact")
     apart: float = constant(0.05, "ω before it is seen: thresholds move outlines by as much")
     memory: float = constant(0.95, "per frame, as of noise")
+    exposed: float = constant(
+        1e-3, "of frames in which a sensor shows all spots larger or smaller than before"
+    )
 
 
 @dataclass(frozen=True)
@@ -76,9 +79,28 @@ class Sizes:
     def cut(self, off: Floats, rules: SizeRules) -> Floats:
         """Return chances (n,) that spots are cut or merged, by ln r/s minus the centre (n,)."""
         tau = self.scatter(rules)
+        return np.asarray(rules.cut * np.exp(-np.abs(off)) / self._density(off, tau, rules))
+
+    def centre_now(self, logs: Floats, centre: float, rules: SizeRules) -> float:
+        """Return the centre of a frame's spots (n,): another one if light or exposure changed.
+
+        Cut spots have any size; spots that are all as much larger or smaller are whole.
+        """
+        tau = self.scatter(rules)
+        if 2 * np.count_nonzero(np.abs(logs - centre) < 3 * tau) >= logs.size:  # as is the median
+            return centre
+        now = float(np.median(logs))
+        before, after = (
+            float(np.log(self._density(logs - c, tau, rules)).sum()) for c in (centre, now)
+        )
+        # the median agrees with one spot by itself
+        by_chance = float(np.log(self._density(np.zeros(1), tau, rules))[0])
+        return now if after - before - by_chance > -np.log(rules.exposed) else centre
+
+    def _density(self, off: Floats, tau: float, rules: SizeRules) -> Floats:
+        """Return densities (n,) of spots, whole or not, by ln r/s minus the centre (n,)."""
         whole = np.exp(-0.5 * (off / tau) ** 2) / (np.sqrt(2 * np.pi) * tau)
-        cut = rules.cut * np.exp(-np.abs(off))
-        return np.asarray(cut / (cut + (1 - rules.cut) * whole))
+        return np.asarray(rules.cut * np.exp(-np.abs(off)) + (1 - rules.cut) * whole)
 
     def followed(self, logs: Mapping[str, Floats], rules: SizeRules) -> Sizes:
         """Return the sums with the spots (n,) of one more frame, by sensor."""
@@ -95,8 +117,11 @@ class Sizes:
         sensors = {name: (rules.memory * n, mean) for name, (n, mean) in self.sensors.items()}
         count, squares = rules.memory * self.count, rules.memory * self.squares
         for (name, values), centre in zip(logs.items(), known.centres([*logs], rules), strict=True):
-            weights = 1 - known.cut(values - centre, rules)
+            now = known.centre_now(values, centre, rules)
+            weights = 1 - known.cut(values - now, rules)
             before, mean = sensors[name] if name in sensors else (0.0, first[name][1])
+            if now != centre:
+                before, mean = 0.0, now
             after = before + float(weights.sum())
             mean += float(weights @ (values - mean)) / max(after, 1e-12)
             sensors[name] = after, mean
@@ -124,7 +149,9 @@ def weighed_by_size(
         if not (isinstance(pattern, PointPattern) and pattern.has_radii and seen.size):
             continue
         scales = all_scales[k, seen[_nearest(pattern.points, images.y[k, 0, seen])]]
-        off, whole = np.log(pattern.radii / scales) - centre, scales * np.exp(centre)
+        logs = np.log(pattern.radii / scales)
+        now = sizes.centre_now(logs, centre, rules)
+        off, whole = logs - now, scales * np.exp(now)
         smaller = np.exp(-2 * np.hypot(off, scatter))
         # per coordinate, of two
         moved = np.maximum(pattern.radii, whole) * (1 - smaller) / np.sqrt(2)
