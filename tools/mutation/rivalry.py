@@ -106,8 +106,8 @@ MUTANTS = (
     Mutant(
         "tracking-mirror-images-go-on-from-the-body",
         "tracking/doubt.py",
-        "return alone if is_known else alone.changed(track=Track())",
-        "return data",
+        "alone = data.alone()  # the track",
+        "alone = data  # the track",
         "what was followed is likelier than its mirror image, which was not",
         ("test_tracking_reflection.py",),
     ),

@@ -40,7 +40,6 @@ from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, depth_reversed, is_flat, mirror_odds
 from mixpose.tracking.proposers import candidates_of, reason, starts_at
 from mixpose.tracking.rivals import log_odds_against
-from mixpose.tracking.track import Track
 
 TWICE = (
     "the body seems to be there twice: a mirror image, one more (`count`), or another like it, "
@@ -313,16 +312,10 @@ def _log_odds_reflected(data: Frame, judged: ScoredPose, is_asked: bool, before:
 
 def _log_odds_from_afar(data: Frame, judged: ScoredPose, near_plane: Mask) -> float:
     """Return log odds of the mirror image with its depth reversed, with nothing known of either."""
-    alone = _by_itself(data)
+    alone = data.alone()  # the track followed the body, and not its mirror image
     start = Start(depth_reversed(data, judged, near_plane), alone.close_uncertainty)
     body = _evidence(alone, Start(judged.T_world_object, left_out=judged.left_out))
     return _evidence(_reflected_frame(alone, near_plane), start) - max(body, -1e9)
-
-
-def _by_itself(data: Frame) -> Frame:
-    """Return the frame with nothing from the frames before, but noise that several ok ones tell."""
-    alone, is_known = data.alone(), data.track.ok_count >= data.rules.proposals.believed
-    return alone if is_known else alone.changed(track=Track())
 
 
 def _is_by_chance(data: Frame, judged: ScoredPose) -> bool:
