@@ -326,7 +326,12 @@ def test_a_truth_line_without_a_pose_says_nothing() -> None:
     T = a_pose()
     truth = file_of(line(0, T), line(1, None, status="lost"))
     outcome = evaluate(file_of(line(0, T), line(1, T)), truth)
-    assert (outcome.frames, outcome.without_truth) == (1, 1)
+    assert (outcome.frames, outcome.without_truth, outcome.ok_without_truth) == (1, 1, 1)
+    told = "1 pose line has no truth and does not count; 1 of them ok: wrong, if the body was away"
+    assert told in as_table(outcome).splitlines()
+    away = evaluate(file_of(line(0, T), line(1, None, status="lost")), truth)
+    assert away.ok_without_truth == 0
+    assert "1 pose line has no truth and does not count" in as_table(away).splitlines()
 
 
 def test_the_report_holds_the_figures_as_json_and_as_an_aligned_table() -> None:

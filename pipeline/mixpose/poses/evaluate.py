@@ -73,6 +73,7 @@ class Evaluation:
     lost: int
     missing: int
     without_truth: int  # pose lines without truth; they count nowhere else
+    ok_without_truth: int  # "ok" ones of these, wrong if the body was away
     # over frames with a pose, "ambiguous" ones included; None without such a frame
     rotation_deg: Spread | None
     translation: Spread | None
@@ -133,6 +134,7 @@ def _evaluation(poses: PoseFile, truth: PoseFile, errors: Sequence[FrameError]) 
     compared = {(error.frame, error.object) for error in errors}
     trusted = [error for error in errors if error.status == "ok"]
     counts = Counter(error.status for error in errors)
+    others = [line for line in poses.poses if (line.frame, line.label) not in compared]
     return Evaluation(
         unit=poses.unit or truth.unit,
         frames=len(errors),
@@ -140,7 +142,8 @@ def _evaluation(poses: PoseFile, truth: PoseFile, errors: Sequence[FrameError]) 
         ambiguous=counts["ambiguous"],
         lost=counts["lost"],
         missing=counts["missing"],
-        without_truth=sum((line.frame, line.label) not in compared for line in poses.poses),
+        without_truth=len(others),
+        ok_without_truth=sum(line.status == "ok" for line in others),
         **_spreads([(error.frame, error.twist) for error in errors]),
         per_axis_rms=_per_axis_rms([error.twist for error in errors if error.twist is not None]),
         **_spreads([(error.frame, error.twist) for error in trusted], "ok_"),

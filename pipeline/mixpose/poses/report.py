@@ -8,7 +8,16 @@ from typing import Any
 from mixpose import rigid
 from mixpose.poses.evaluate import Evaluation, Spread
 
-_COUNTED = ("unit", "frames", "ok", "ambiguous", "lost", "missing", "without_truth")
+_COUNTED = (
+    "unit",
+    "frames",
+    "ok",
+    "ambiguous",
+    "lost",
+    "missing",
+    "without_truth",
+    "ok_without_truth",
+)
 _STATISTICS = ("rms", "median", "p95", "max")
 
 
@@ -76,10 +85,11 @@ def _one_body(evaluation: Evaluation) -> list[str]:
     unit = evaluation.unit or "units"
     lines = [_counts(evaluation, "frames")]
     if evaluation.without_truth:
-        many = evaluation.without_truth != 1
+        many, ok = evaluation.without_truth != 1, evaluation.ok_without_truth
+        of_nothing = f"; {ok} of them ok: wrong, if the body was away" if ok else ""
         lines.append(
             f"{evaluation.without_truth} pose line{'s have' if many else ' has'} no truth and "
-            f"{'do' if many else 'does'} not count"
+            f"{'do' if many else 'does'} not count{of_nothing}"
         )
     lines += ["", *_spread_lines(evaluation, unit), *_axis_lines(evaluation, unit)]
     remarks = []
