@@ -104,8 +104,8 @@ HARMLESS: tuple[Harmless, ...] = (
     ),
     Harmless(
         "pictures/plots.py",
-        "places = np.stack([ranges, np.zeros_like(ranges)], axis=-1)",
-        "places = np.stack([ranges, np.zeros_like(ranges)], axis=+1)",
+        "places = np.stack([ranges, np.zeros_like(ranges)], axis=-1)[None, None]",
+        "places = np.stack([ranges, np.zeros_like(ranges)], axis=+1)[None, None]",
         "equivalent: of two arrays of one axis",
     ),
     Harmless(
