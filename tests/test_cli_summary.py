@@ -14,7 +14,7 @@ from mixpose.cli.notices import Summary
 from mixpose.cli.request import RunRequest
 from mixpose.cli.run import run_session
 from mixpose.density import Observation
-from mixpose.judgement import MEETS_NOTHING
+from mixpose.judgement import APART, MEETS_NOTHING
 from mixpose.objective import View
 from mixpose.records import (
     Estimate,
@@ -72,6 +72,22 @@ def test_ranges_and_soft_bodies_may_be_far_off(session: Session) -> None:
     assert summary(ranges, [met(0.9, 1.4)] * 3).warnings() == []
     soft = Body("soft", tuple(PointFeature(x, np.eye(3)) for x in session.body.means))
     assert summary(replace(session, body=soft), [met(0.9, 1.4)] * 2).warnings() == []
+
+
+def test_a_change_is_told_from_its_first_frame_on_whatever_some_frames_are_doubted_for(
+    session: Session,
+) -> None:
+    """Of some frames after a bump other poses explain as much, and no doubt has a name."""
+    counted, label = Summary(session), session.labels[0]
+    names = [setup.name for setup in session.sensors]
+    sensors = dict(zip(names, [met(0.9)] * 2, strict=True))
+    ok = Estimate(0, None, label, "ok", np.eye(4), None, 0.5, sensors)
+    for frame in range(30):
+        status: Status = "ok" if frame < 10 else "ambiguous"
+        doubt = "" if frame < 10 or frame % 4 == 3 else APART
+        counted.add(replace(ok, frame=frame, status=status, doubt=doubt))
+    told = f"{APART} from frame 10 on: was one of them bumped?"
+    assert told in counted.warnings()
 
 
 def test_sensors_that_take_turns_are_told(session: Session) -> None:

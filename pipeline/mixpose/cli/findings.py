@@ -49,7 +49,7 @@ class Stretches:
         """Add a frame, the `place`-th of the run."""
         if place == self.last_place:
             return
-        if place == self.last_place + 1:
+        if self.kept and place == self.last_place + 1:
             self.kept[-1][1:] = [frame, self.kept[-1][2] + 1]
         else:
             if len(self.kept) > _SHOWN:  # the shortest will not be named any more
@@ -92,7 +92,7 @@ class Findings:
         self._shown: dict[str, NDArray[Any]] = {}
         self._repeating: set[str] = set()  # sensors that show the same as in the frame before
         self._doubts: dict[str, Stretches] = {}
-        self._doubted = Stretches()  # frames with any doubt
+        self._doubted = Stretches()  # frames that are ambiguous, or with any doubt
         self._markers: dict[str, dict[int, Marker]] = {}
         self._sizes = {label: BodySize(session, body.means) for label, body in self._bodies.items()}
         self._frames: list[tuple[int, list[View]]] = []
@@ -141,9 +141,10 @@ class Findings:
         self._ok += estimate.status == "ok"
         self._lost += estimate.status == "lost"
         self._add_repeats(estimate)
+        if estimate.doubt or estimate.status == "ambiguous":
+            self._doubted.add(estimate.frame, self._places)
         if estimate.doubt:
             self._doubts.setdefault(estimate.doubt, Stretches()).add(estimate.frame, self._places)
-            self._doubted.add(estimate.frame, self._places)
         elif estimate.status == "ok":
             self._agreed_before += not self._doubts
             self._add_residuals(estimate)
