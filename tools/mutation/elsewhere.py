@@ -75,7 +75,7 @@ MUTANTS = (
     Mutant(
         "calibration-any-difference-of-frames-is-a-bump",
         "calibration/profile.py",
-        "if max(score.squared for score in others) > max(_LEFT * worst.squared, _CHANCE):",
+        "if max(score.squared for score in others) > max(rules.left * worst.squared, by_chance):",
         "if False:",
         "of skin that carries markers it is said that a camera was bumped",
         ("test_calibration_doubts.py",),

@@ -12,12 +12,7 @@ from mixpose.calibration.adjust import Adjusted, adjust, deviations_by_held, fit
 from mixpose.calibration.bundle import Bundle
 from mixpose.calibration.gauge import gauge_rows
 from mixpose.calibration.latecomers import place_camera
-from mixpose.calibration.profile import (
-    FEWEST,
-    Contradiction,
-    find_contradiction,
-    with_profiled_lenses,
-)
+from mixpose.calibration.profile import Contradiction, find_contradiction, with_profiled_lenses
 from mixpose.calibration.recorded import folds_of
 from mixpose.calibration.rig import Block, Kind, Rig, State, blocks_of, centre_of, kinds_of
 from mixpose.calibration.rules import CalibrationRules
@@ -247,7 +242,9 @@ class _Run:
             rows = np.flatnonzero(unmet[:, s])
             frames = [start.frames[row] for row in rows]
             state = best.state._replace(poses=best.state.poses[rows])
-            if len(frames) >= FEWEST and self._place(s, state, frames, best.noise) is not None:
+            if len(frames) < rules.elsewhere:
+                continue
+            if self._place(s, state, frames, best.noise) is not None:
                 name, numbers = self._task.rig.names[s], (frames[0].number, frames[-1].number)
                 return Contradiction((name,), frames=numbers)
         return None

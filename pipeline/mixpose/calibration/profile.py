@@ -26,11 +26,7 @@ from mixpose.records import Floats
 
 _LENSES = ("focal", "principal_point", "distortion")
 _WIDER, _TIMES = 10.0, 4  # largest factor of one widening, and number of widenings
-FEWEST = 4  # frames in which a sensor stands elsewhere: fewer are bad ones
 _MOMENTS = 9  # frames from which a change of a sensor is tried, before the best of them is refined
-_LEFT = 0.1  # of a change's evidence: what it leaves of others, else it is not the only change
-_CHANCE = float(chi2.isf(1e-3, 6))  # what changes of any pose have by chance: a hundred are tried
-_ALIKE = 2 * np.log(1e6)  # of chi-square: changes that explain as much as the likeliest
 
 
 def with_profiled_lenses(bundle: Bundle, adjusted: Adjusted) -> Adjusted:
@@ -131,10 +127,13 @@ def find_contradiction(
     frames = bundle.frames[block.since].number, bundle.frames[-1].number
     freed = replace(known, blocks=(*known.blocks, replace(block, start=bundle.count)))
     others = _likeliest_changes(freed, adjusted, weighted, poses)
-    if max(score.squared for score in others) > max(_LEFT * worst.squared, _CHANCE):
+    by_chance = float(chi2.isf(rules.left_by_chance, max(score.freedom for score in others)))
+    if max(score.squared for score in others) > max(rules.left * worst.squared, by_chance):
         return Contradiction((), worst.parameter, worst.moves, frames)
-    alike = [s.block.sensor for s in changes if s.worth > worst.worth - _ALIKE]
-    names = tuple(state.rig.names[s] for s in alike if s is not None)
+    # that explain as much as the likeliest
+    alike = -2 * np.log(rules.by_chance)
+    sensors = [s.block.sensor for s in changes if s.worth > worst.worth - alike]
+    names = tuple(state.rig.names[s] for s in sensors if s is not None)
     return Contradiction(names, worst.parameter, worst.moves, frames)
 
 
@@ -180,7 +179,8 @@ def _likeliest_changes(
     """
     changes = []
     for pose in poses:
-        first, last, width = FEWEST, len(bundle.frames) - FEWEST, len(pose.names)
+        first, width = bundle.rules.elsewhere, len(pose.names)
+        last = len(bundle.frames) - first
         while first <= last:
             moments = np.unique(np.linspace(first, last, _MOMENTS).astype(int))
             starts = bundle.count + width * np.arange(len(moments))

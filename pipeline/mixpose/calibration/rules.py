@@ -92,6 +92,13 @@ class CalibrationRules:
         "probability of such a contradiction if held parameters are right: up to a hundred kinds "
         "are tested",
     )
+    elsewhere: int = constant(4, "frames in which a sensor stands elsewhere: fewer are bad ones")
+    left: float = constant(
+        0.1, "of a change's evidence: what it leaves of others; else it is not the only change"
+    )
+    left_by_chance: float = constant(
+        1e-3, "probability of the most that is left so: changes of all sensors are tried"
+    )
     rising: float = constant(
         1.5,
         "largest ratio of the residual of frames held back to that of the others: with six or more "
