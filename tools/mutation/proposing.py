@@ -272,18 +272,16 @@ _REFLECTION = (
     Mutant(
         "tracking-mirror-images-pass",
         "tracking/doubt.py",
-        "            near = max([_evidence(mirror_frame, start) for start in starts]) - "
-        "body_evidence",
-        "            near = -math.inf",
+        "    odds = max([_evidence(mirror, start) for start in starts]) - judged.log_evidence\n",
+        "    odds = -math.inf\n",
         "the body in a window is taken for the body",
         ("test_tracking_reflection.py",),
     ),
     Mutant(
         "tracking-mirror-images-are-suspected-everywhere",
         "tracking/doubt.py",
-        "            near = max([_evidence(mirror_frame, start) for start in starts]) - "
-        "body_evidence",
-        "            near = 9.0",
+        "    odds = max([_evidence(mirror, start) for start in starts]) - judged.log_evidence\n",
+        "    odds = 9.0\n",
         "a flat body with a hidden marker is never sure",
         ("test_tracking_reflection.py",),
     ),
@@ -298,9 +296,8 @@ _REFLECTION = (
     Mutant(
         "tracking-a-body-given-mirrored-passes",
         "tracking/doubt.py",
-        "    return next((odds for odds in log_odds if odds > likely), near if is_asked else "
-        "-math.inf)",
-        "    return -math.inf",
+        "return next((odds for odds in _log_odds_anywhere(alone) if odds > likely), otherwise)",
+        "return -math.inf",
         "few markers of a body given mirrored are met by chance, and the pose is ok",
         ("test_tracking_reflection.py",),
     ),
@@ -315,9 +312,8 @@ _REFLECTION = (
     Mutant(
         "tracking-few-markers-are-a-mirror-image",
         "tracking/doubt.py",
-        "    return next((odds for odds in log_odds if odds > likely), near if is_asked else "
-        "-math.inf)",
-        "    return next((9.0 for odds in log_odds), -math.inf)",
+        "return next((odds for odds in _log_odds_anywhere(alone) if odds > likely), otherwise)",
+        "return next((9.0 for odds in _log_odds_anywhere(alone)), -math.inf)",
         "a body whose markers are hidden beside false points is never sure",
         ("test_tracking_reflection.py",),
     ),

@@ -217,15 +217,15 @@ def _fitted(
     The prior of its sizes has deviations of 1 if left out.
     """
     r, degrees, s2 = noise
-    width, root = X.shape[1], np.eye(X.shape[1])
+    width = X.shape[1]
+    known, root = np.zeros(width), np.eye(width)
     if prior is not None:
         values, axes = np.linalg.eigh(prior.covariance)
-        root = axes * np.sqrt(np.maximum(values, 0.0))
-    prior = prior or Sizes(np.zeros(width), root)
-    logs, means, spreads = evidence_of(_joined(usual, X @ root), r - X @ prior.mean, degrees, s2)
+        known, root = prior.mean, axes * np.sqrt(np.maximum(values, 0.0))
+    logs, means, spreads = evidence_of(_joined(usual, X @ root), r - X @ known, degrees, s2)
     best = logs.argmax()
     more = Sizes(means[best, -width:], spreads[best, -width:, -width:]).times(root)
-    return float(np.logaddexp.reduce(logs)), Sizes(prior.mean + more.mean, more.covariance)
+    return float(np.logaddexp.reduce(logs)), Sizes(known + more.mean, more.covariance)
 
 
 def _names_of(matches: Matches) -> list[str]:

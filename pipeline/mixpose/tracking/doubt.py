@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
 from itertools import combinations
 
 import numpy as np
 
-from mixpose.body import mirror_image, thickness
+from mixpose.body import mirror_image, other_tilt, thickness
 from mixpose.judgement import (
     APART,
     Alternative,
@@ -37,7 +38,7 @@ from mixpose.judgement import (
 from mixpose.records import Floats, Mask, replace
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
-from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, depth_reversed, is_flat, mirror_odds
+from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, is_flat, mirror_odds
 from mixpose.tracking.proposers import candidates_of, reason, starts_at
 from mixpose.tracking.rivals import log_odds_against
 
@@ -87,14 +88,14 @@ def _mistaken_after(
     data: Frame, best: ScoredPose, mistakes: Sequence[Mistake]
 ) -> dict[str, Mistake]:
     """Return what is known of mistakes in the session after a frame, by name."""
-    before = data.track.mistaken
+    track = data.track
     if best.residual_ratio > data.rules.acceptance.changed:
         # an unusual frame, which may be a doubled image, for example, tells sizes alone
         sizes = {mistake.name: mistake for mistake in mistakes if mistake.lasting}
-        known = {
-            name: min(sizes[name].log_odds, data.track.log_odds_mistaken(name)) for name in sizes
-        }
-        return {**before, **{name: sizes[name]._replace(log_odds=known[name]) for name in sizes}}
+        for name, mistake in sizes.items():
+            least = min(mistake.log_odds, track.log_odds_mistaken(name))
+            sizes[name] = mistake._replace(log_odds=least)
+        return {**track.mistaken, **sizes}
     # a single frame may mislead as rarely as a session is mistaken
     most, least = _largest_log_odds(data), -_even_odds(data)
     return {
@@ -271,51 +272,84 @@ def _log_odds_reflected(data: Frame, judged: ScoredPose, is_asked: bool, before:
 
     An unlikely mirror image is only sought where it `is_asked` for.
     """
-    rules, matches, T = data.rules, judged.matches, judged.T_world_object
+    rules = data.rules
     # a body that a turn maps onto its mirror image looks the same as that in every camera
     can_be = data.body.is_exact and thickness(data.body) >= 1e-6
     if "mirrored" not in rules.look_alikes.kinds or not can_be:
         return -math.inf
-    accepted, met, near = rules.acceptance, matches.met_by, -math.inf
-    body_evidence = judged.log_evidence
-    likely = accepted.log_doubt - math.log(accepted.mistaken) - before
+    likely = rules.acceptance.log_doubt - math.log(rules.acceptance.mistaken) - before
+    alone = _Alone(data, judged)
+    near = _log_odds_near(alone, is_asked, likely)
+    if near > likely:
+        return near
+    otherwise = near if is_asked else -math.inf
+    # e.g. rolling shutters: without its motion the body meets nothing
+    if not _is_by_chance(data, judged) or alone.evidence == -math.inf:
+        return otherwise
+    return next((odds for odds in _log_odds_anywhere(alone) if odds > likely), otherwise)
+
+
+@dataclass(frozen=True, eq=False)
+class _Alone:
+    """A frame by itself, with nothing known but noise, beside the frame of a track."""
+
+    tracked: Frame
+    judged: ScoredPose
+
+    @cached_property
+    def frame(self) -> Frame:
+        """Return the frame with nothing from the frames before."""
+        return self.tracked.alone()
+
+    @cached_property
+    def evidence(self) -> float:
+        """Return the evidence of the pose in it."""
+        start = Start(self.judged.T_world_object, left_out=self.judged.left_out)
+        return _evidence(self.frame, start)
+
+
+def _log_odds_near(alone: _Alone, is_asked: bool, likely: float) -> float:
+    """Return log odds of the mirror image where the body is; −∞ where it is not worth a look."""
+    data, judged = alone.tracked, alone.judged
+    matches, T, met = judged.matches, judged.T_world_object, judged.matches.met_by
     # missed features beside unmatched detections: a mirror image may meet more than the body
-    if is_asked or sum(np.minimum(matches.missed, matches.unmatched_nearby).tolist()) > 0.5:
-        # one camera alone may have met a feature by chance
-        sharp = met >= min(2, met.max())
-        near_plane = sharp if sharp.sum() >= 3 else met > 0
-        mirror_frame = _reflected_frame(data, near_plane)
-        # rivals meet at least a quarter of the body's features; values grow as the square
-        value = float(data.finest.weights[:, 0] @ matches.explained)
-        if is_asked or mirror_frame.finest.value(T) > value / 16:
-            # fitted, which may end at clutter; and as it stands, if asked for
-            rival = data.rival(judged, T, data.close_uncertainty, ahead=likely)
-            starts = [rival, *([Start(T)] if is_asked else [])]
-            near = max([_evidence(mirror_frame, start) for start in starts]) - body_evidence
-            if is_asked and not data.is_timed:  # at rest, late sensors meet moving bodies elsewhere
-                near = max(near, _log_odds_from_afar(data, judged, near_plane))
-            if near > likely:
-                return near
-    if not _is_by_chance(data, judged):
-        return near if is_asked else -math.inf
-    # sought everywhere, nothing known of either; the first guesses meet the better of the two
-    alone = data.alone()
-    body_evidence = _evidence(alone, Start(T, left_out=judged.left_out))
-    if body_evidence == -math.inf:  # e.g. rolling shutters: without its motion it meets nothing
-        return near if is_asked else -math.inf
-    mirror = _reflected_frame(alone, met >= 0)
-    least = body_evidence - rules.search.outdone
+    if not is_asked and sum(np.minimum(matches.missed, matches.unmatched_nearby).tolist()) <= 0.5:
+        return -math.inf
+    # one camera alone may have met a feature by chance
+    sharp = met >= min(2, met.max())
+    features = _numbers(sharp if sharp.sum() >= 3 else met > 0)
+    mirror = _reflected_frame(data, features)
+    # rivals meet at least a quarter of the body's features; values grow as the square
+    value = float(data.finest.weights[:, 0] @ matches.explained)
+    if not is_asked and mirror.finest.value(T) <= value / 16:
+        return -math.inf
+    # fitted, which may end at clutter; and as it stands, if asked for
+    rival = data.rival(judged, T, data.close_uncertainty, ahead=likely)
+    starts = [rival, *([Start(T)] if is_asked else [])]
+    odds = max([_evidence(mirror, start) for start in starts]) - judged.log_evidence
+    # at rest, late sensors meet moving bodies elsewhere
+    if is_asked and not data.is_timed and alone.evidence > -math.inf:
+        # with its depth reversed; the track followed the body, and not this one
+        T_reversed = other_tilt(data.body, features, T, _across(judged))
+        start = Start(T_reversed, alone.frame.close_uncertainty)
+        odds = max(odds, _evidence(_reflected_frame(alone.frame, features), start) - alone.evidence)
+    return odds
+
+
+def _log_odds_anywhere(alone: _Alone) -> Iterator[float]:
+    """Yield log odds of the mirror image wherever it is found, with nothing known of either."""
+    mirror = _reflected_frame(alone.frame, _numbers(alone.judged.matches.met_by >= 0))
+    # the first guesses meet the better of the two
+    least = alone.evidence - alone.tracked.rules.search.outdone
     rivals = [rival for rival in candidates_of(mirror) if rival.evidence > least]
-    log_odds = (_evidence(mirror, start) - body_evidence for start in starts_at(mirror, rivals))
-    return next((odds for odds in log_odds if odds > likely), near if is_asked else -math.inf)
+    for start in starts_at(mirror, rivals):
+        yield _evidence(mirror, start) - alone.evidence
 
 
-def _log_odds_from_afar(data: Frame, judged: ScoredPose, near_plane: Mask) -> float:
-    """Return log odds of the mirror image with its depth reversed, with nothing known of either."""
-    alone = data.alone()  # the track followed the body, and not its mirror image
-    start = Start(depth_reversed(data, judged, near_plane), alone.close_uncertainty)
-    body = _evidence(alone, Start(judged.T_world_object, left_out=judged.left_out))
-    return _evidence(_reflected_frame(alone, near_plane), start) - max(body, -1e9)
+def _across(judged: ScoredPose) -> Floats:
+    """Return the direction (3,) in the world in which sensors see least of a shift."""
+    by_shift = judged.used.J[..., :3].reshape(-1, 3)
+    return np.asarray(np.linalg.eigh(by_shift.T @ by_shift)[1][:, 0])
 
 
 def _is_by_chance(data: Frame, judged: ScoredPose) -> bool:
@@ -338,6 +372,11 @@ def _evidence(data: Frame, start: Start) -> float:
     return likelihood.judge(likelihood.fit(start), start).log_evidence
 
 
-def _reflected_frame(data: Frame, chosen: Mask) -> Frame:
-    """Return the frame for the body reflected in the plane nearest to some features (N,)."""
-    return data.with_body(mirror_image(data.body, frozenset(np.flatnonzero(chosen).tolist())))
+def _reflected_frame(data: Frame, features: frozenset[int]) -> Frame:
+    """Return the frame for the body reflected in the plane nearest to some features."""
+    return data.with_body(mirror_image(data.body, features))
+
+
+def _numbers(chosen: Mask) -> frozenset[int]:
+    """Return the numbers of chosen features (N,)."""
+    return frozenset(np.flatnonzero(chosen).tolist())

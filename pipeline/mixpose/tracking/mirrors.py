@@ -25,8 +25,8 @@ from mixpose.body import (
 )
 from mixpose.body.symmetry import motions
 from mixpose.judgement import ScoredPose
-from mixpose.records import Floats, Mask
-from mixpose.rigid import from_parts, inverse, perturb, transform
+from mixpose.records import Floats
+from mixpose.rigid import inverse, perturb, transform
 from mixpose.tracking.frame import Frame, Setup
 
 MIRRORED = "it shows the body's mirror image"
@@ -39,19 +39,6 @@ def is_flat(data: Setup) -> bool:
     """Test whether the body is flat and a turn brings it, with its faces, onto its mirror image."""
     body, alike = data.body, data.rules.look_alikes.alike
     return body.is_exact and thickness(body) < alike and bool(_improper_symmetries(body, alike))
-
-
-def depth_reversed(data: Frame, judged: ScoredPose, near_plane: Mask) -> Floats:
-    """Return the pose (4, 4) of the body's mirror image that looks as the body does from afar.
-
-    The mirror image is that in the plane nearest to some features (N,).  At this pose it is the
-    body reflected in the plane across the direction in which sensors see least of a shift.
-    """
-    T, means = judged.T_world_object, data.body.means
-    by_shift = judged.used.J[..., :3].reshape(-1, 3)
-    across = np.linalg.eigh(by_shift.T @ by_shift)[1][:, 0]
-    R, centre = np.eye(3) - 2 * np.outer(across, across), transform(T, means).mean(axis=0)
-    return from_parts(R, centre - R @ centre) @ T @ reflection(means[near_plane])
 
 
 def mirror_odds(data: Frame, first: ScoredPose, second: ScoredPose) -> tuple[float, bool]:

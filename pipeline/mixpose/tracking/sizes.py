@@ -79,7 +79,7 @@ class Sizes:
     def cut(self, off: Floats, rules: SizeRules) -> Floats:
         """Return chances (n,) that spots are cut or merged, by ln r/s minus the centre (n,)."""
         tau = self.scatter(rules)
-        return np.asarray(rules.cut * np.exp(-np.abs(off)) / self._density(off, tau, rules))
+        return np.asarray(rules.cut * np.exp(-np.abs(off)) / _density(off, tau, rules))
 
     def centre_now(self, logs: Floats, centre: float, rules: SizeRules) -> float:
         """Return the centre of a frame's spots (n,): another one if light or exposure changed.
@@ -90,17 +90,10 @@ class Sizes:
         if 2 * np.count_nonzero(np.abs(logs - centre) < 3 * tau) >= logs.size:  # as is the median
             return centre
         now = float(np.median(logs))
-        before, after = (
-            float(np.log(self._density(logs - c, tau, rules)).sum()) for c in (centre, now)
-        )
+        before, after = (float(np.log(_density(logs - c, tau, rules)).sum()) for c in (centre, now))
         # the median agrees with one spot by itself
-        by_chance = float(np.log(self._density(np.zeros(1), tau, rules))[0])
+        by_chance = float(np.log(_density(np.zeros(1), tau, rules))[0])
         return now if after - before - by_chance > -np.log(rules.exposed) else centre
-
-    def _density(self, off: Floats, tau: float, rules: SizeRules) -> Floats:
-        """Return densities (n,) of spots, whole or not, by ln r/s minus the centre (n,)."""
-        whole = np.exp(-0.5 * (off / tau) ** 2) / (np.sqrt(2 * np.pi) * tau)
-        return np.asarray(rules.cut * np.exp(-np.abs(off)) + (1 - rules.cut) * whole)
 
     def followed(self, logs: Mapping[str, Floats], rules: SizeRules) -> Sizes:
         """Return the sums with the spots (n,) of one more frame, by sensor."""
@@ -131,6 +124,12 @@ class Sizes:
             return self
         mean = sum([n * mean for n, mean in sensors.values()]) / count
         return Sizes(count, mean, squares, sensors)
+
+
+def _density(off: Floats, tau: float, rules: SizeRules) -> Floats:
+    """Return densities (n,) of spots, whole or not, by ln r/s minus the centre (n,)."""
+    whole = np.exp(-0.5 * (off / tau) ** 2) / (np.sqrt(2 * np.pi) * tau)
+    return np.asarray(rules.cut * np.exp(-np.abs(off)) + (1 - rules.cut) * whole)
 
 
 def weighed_by_size(
