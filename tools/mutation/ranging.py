@@ -5,6 +5,7 @@ from __future__ import annotations
 from mutation.mutant import Mutant
 
 _RANGES, _MAXIMA = "test_tracking_ranges.py", "test_tracking_range_maxima.py"
+_FAULTS = "test_tracking_range_faults.py"
 
 MUTANTS = (
     Mutant(
@@ -142,5 +143,21 @@ MUTANTS = (
         "residual_degrees = sums.reached - count",
         "fewer ranges than directions are searched again in every frame",
         (_MAXIMA,),
+    ),
+    Mutant(
+        "tracking-ranges-sensors-never-fail",
+        "tracking/ranges.py",
+        "return float(logit(frame.rules.acceptance.mistaken))",
+        "return -np.inf",
+        "all ranges of a covered sensor count, each as one detection that is false by chance",
+        (_FAULTS,),
+    ),
+    Mutant(
+        "tracking-ranges-failing-sensors-forgotten",
+        "tracking/tracker.py",
+        "failing={**track.failing, **best.failing},",
+        "failing={},",
+        "in each frame anew a covered sensor has to be told from the others",
+        (_FAULTS,),
     ),
 )

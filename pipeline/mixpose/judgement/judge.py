@@ -74,6 +74,7 @@ class ScoredPose:
     spread: Floats | None = None  # (6,) standard deviations, where as large as its motion
     # log odds that a better pose of single ranges was not looked at; None: not computed
     elsewhere: float | None = None
+    failing: Mapping[str, float] = field(default_factory=dict)  # see `Track`, after this frame
     by_count: float = 0.0  # log evidence by count, less that by volume
     proposer: str = ""  # where the pose came from
     blurs: tuple[Mapping[str, float], ...] = ()  # by sensor, at which it was fitted

@@ -6,9 +6,12 @@ sensor, every association λ gives each feature at most one detection and the re
 
     L = Σ_λ  Π_met P_D N(offset; 0, s²)  Π_missed (1 − P_D)  Π_rest c/W,
 
-c being the expected number of false detections and W the room they have.  It has many maxima, also
-within the prior of the track.  Their evidence adds up over frames: all maxima that a further frame
-may make likely are followed.  What the best leaves unexplained counts for one not found so far.
+c being the expected number of false detections and W the room they have.  A sensor may also fail,
+its ranges all off alike or of something else: then all of them are clutter.  What frames show of
+that adds up, from the odds of a mistake in the session.  The product over sensors has many maxima,
+also within the prior of the track.  Their evidence adds up over frames: all maxima that a further
+frame may make likely are followed.  What the best leaves unexplained counts for one not found so
+far.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri, expit
+from scipy.special import chdtri, expit, logit
 
 from mixpose.body import Body
 from mixpose.fit import Fit, blurs_by_view, narrowing, widest_blurs
@@ -64,6 +67,7 @@ class AssociationSum(NamedTuple):
     squares: Floats  # (H,), expected sum of their squared offsets, in σ_ε²
     most: Floats  # (H,), log odds if all features in view were met exactly
     reached: Floats  # (H,), number of these features
+    by_sensor: Floats  # (L, H), log odds of each sensor if it does not fail
     J: Floats  # (L, H, n, 6), of ranges to features by the twist of the pose
     weights: Floats  # (L, H, n, M), of pairs
     pulls: Floats  # (L, H, n, M), weighted offsets
@@ -75,6 +79,7 @@ def sum_associations(
     poses: Floats,  # (H, 4, 4)
     noise: float = 1.0,  # standard deviation of offsets, in σ_ε
     detection: DetectionModel = DetectionModel(),
+    failing: Floats | float = -np.inf,  # (L, 1) log odds that sensors fail
 ) -> AssociationSum:
     """Sum the likelihood over all associations at poses."""
     patterns = [view.observation.pattern for view in views]
@@ -99,21 +104,30 @@ def sum_associations(
     odds *= ratio[..., None, None]
     odds *= images.seen[..., None] & is_range[:, None, None]
     total, shares = _sum_and_shares(odds.reshape(-1, *odds.shape[2:]))
-    shares = shares.reshape(odds.shape)
+    by_sensor = missed + np.log(total).reshape(missed.shape)
+    most = missed + reached * peak
+    working, usual = expit(by_sensor - failing), expit(most - failing)
+    shares = shares.reshape(odds.shape) * working[..., None, None]
     weights = shares / error**2
     pulls = weights * offsets
     return AssociationSum(
-        log_odds=(missed + np.log(total).reshape(missed.shape)).sum(axis=0),
+        log_odds=_with_failure(by_sensor, failing),
         gradient=np.einsum("lhn,lhnk->hk", pulls.sum(axis=3), J),
         information=_squares(weights.sum(axis=3), J),
         met=shares.sum(axis=(0, 2, 3)),
         squares=noise**2 * (pulls * offsets).sum(axis=(0, 2, 3)),
-        most=(missed + reached * peak).sum(axis=0),
-        reached=reached.sum(axis=0),
+        most=_with_failure(most, failing),
+        reached=(usual * reached).sum(axis=0),
+        by_sensor=by_sensor,
         J=J,
         weights=weights,
         pulls=pulls,
     )
+
+
+def _with_failure(log_odds: Floats, failing: Floats | float) -> Floats:
+    """Return log odds (H,) of all sensors, by those of each (L, H) if it does not fail."""
+    return np.asarray((np.logaddexp(log_odds, failing) - np.logaddexp(0.0, failing)).sum(axis=0))
 
 
 def _squares(weights: Floats, J: Floats) -> Floats:
@@ -149,6 +163,17 @@ def _sum_and_shares(odds: Floats) -> tuple[Floats, Floats]:
     return total, shares
 
 
+def failing_before(frame: Frame) -> Floats:
+    """Return log odds (L, 1) that sensors fail, by the frames before."""
+    known, unknown = frame.track.failing, _unknown(frame)
+    return np.array([[known.get(view.name, unknown)] for view in frame.views])
+
+
+def _unknown(frame: Frame) -> float:
+    """Return the log odds that a sensor fails of which nothing is known."""
+    return float(logit(frame.rules.acceptance.mistaken))
+
+
 @dataclass(frozen=True, eq=False)
 class AssociationTerm:
     """The logarithm of `sum_associations`."""
@@ -180,8 +205,8 @@ class AssociationTerm:
 
     def _sum(self, poses: Floats) -> AssociationSum:
         frame = self.frame
-        detection = frame.rules.judgement.detection
-        return sum_associations(frame.views, frame.body, poses, self.noise, detection)
+        detection, failing = frame.rules.judgement.detection, failing_before(frame)
+        return sum_associations(frame.views, frame.body, poses, self.noise, detection, failing)
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,7 +289,9 @@ class AssociationLikelihood:
         """Judge a pose by the sum over all associations and by the track's prior."""
         frame, T, rules = self.frame, fit.T_world_object, self.frame.rules
         model, before = rules.judgement, frame.track.residuals
-        sums = sum_associations(frame.views, frame.body, T[None], self._noise, model.detection)
+        failing, detection = failing_before(frame), model.detection
+        sums = sum_associations(frame.views, frame.body, T[None], self._noise, detection, failing)
+        shown = np.maximum(failing - sums.by_sensor, _unknown(frame))[:, 0].tolist()
         count = int(frame.free.sum())
         degrees = max(float(sums.met[0]) - count, 0.0)
         squares = float(sums.squares[0]) if degrees else 0.0
@@ -281,6 +308,7 @@ class AssociationLikelihood:
             noise=before.followed(RANGES, noise, before.moments, before.biases, before.fields),
             spread=np.sqrt(np.diag(covariance)),
             elsewhere=float(np.logaddexp(frame.track.elsewhere, -expected)) + ahead,
+            failing=dict(zip([view.name for view in frame.views], shown, strict=True)),
         )
 
     def _covariance(self, T: Floats, sums: AssociationSum) -> tuple[Floats, float]:

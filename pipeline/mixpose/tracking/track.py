@@ -196,6 +196,8 @@ class Track:
     doubted: bool = False  # whether the last frame was not ok
     # log odds, of single ranges, of a better pose not searched for so far; if high it is searched
     elsewhere: float = -math.inf
+    # log odds by name that sensors fail, whose single ranges are all off or of something else
+    failing: Mapping[str, float] = field(default_factory=dict)
     sensors_agreed: bool = False  # whether two sensors met most of the body in some frame
     ok_count: int = 0  # frames whose pose was ok
     gained: float = 0.0  # log evidence per met coordinate of the last ok pose

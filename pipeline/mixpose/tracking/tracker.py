@@ -364,6 +364,7 @@ def track_after(data: Frame, verdict: Verdict) -> Track:
         or (track.is_identified and log_odds_other(data, best) < data.rules.acceptance.log_doubt),
         ok_count=track.ok_count + is_ok,
         elsewhere=_elsewhere_after(data, best),
+        failing={**track.failing, **best.failing},
         gained=best.gained if is_ok else track.gained,
         shape=None if is_ok else verdict.shape,
         doubted=not is_ok,
