@@ -53,7 +53,10 @@ def test_a_right_session_has_nothing_wrong(right: Session) -> None:
 @pytest.mark.parametrize(
     ("fault", "said"),
     [
-        (lambda s: with_points(s, s.body.means * [1, -1, 1]), "the body of [object] is mirrored: "),
+        (
+            lambda s: with_points(s, s.body.means * [1, -1, 1]),
+            "the body of [object] is mirrored, or seen in a mirror: ",
+        ),
         (lambda s: with_points(s, s.body.means / 1000), "with points 1000 times as large"),
         (lambda s: with_points(s, s.body.means / 10), "with points 10 times as large"),
         (lambda s: with_points(s, s.body.means * 1.02), "with points 0.98 times as large"),
@@ -100,7 +103,8 @@ def test_one_camera_cannot_tell_its_images_mirrored_from_the_body(right: Session
     mirrored = with_points(centred, centred.body.means * [1, 1, -1])
     text = told(mirrored, recorded(centred))
     assert text.startswith(
-        "the body of [object] may be mirrored, or images of 'left' may be mirrored: with one "
+        "the body of [object] may be mirrored, or seen in a mirror, or images of 'left' "
+        "may be mirrored: with one "
     )
 
 
@@ -230,7 +234,9 @@ def test_the_change_that_leads_is_tried_in_all_frames(
 ) -> None:
     searched = searches_of(monkeypatch, 0.09 * DiagnosisRules().all_guesses)
     mirrored = with_points(right, right.body.means * [1, -1, 1])
-    assert told(mirrored, recorded(right)).startswith("the body of [object] is mirrored: ")
+    assert told(mirrored, recorded(right)).startswith(
+        "the body of [object] is mirrored, or seen in a mirror: "
+    )
     # the session as it is, as many changes as there are guesses for, the best of them to the end
     assert searched == [0, 1, 2, 3, *12 * [0], 1, 2, 3]
 

@@ -11,9 +11,12 @@ import pytest
 from mixpose.body import ASIDE, TURNED
 from mixpose.cli.findings import Findings
 from mixpose.cli.marker_offsets import Marker
+from mixpose.cli.notices import Summary
 from mixpose.density import Observation
+from mixpose.judgement import APART
 from mixpose.objective import View
 from mixpose.records import (
+    DelayEstimate,
     Estimate,
     FrameSet,
     Offsets,
@@ -41,6 +44,24 @@ def test_poses_before_the_body_is_seen_twice_may_be_of_its_mirror_image(before: 
     (line,) = findings.causes()
     assert line.startswith(f"{TWICE} in {20 - before} of 20 frames")
     assert line.endswith("is there a mirror?") == (before > 0)
+
+
+@pytest.mark.parametrize(("seconds", "is_late"), [(0.01, True), (4e-4, False)])
+def test_a_delay_that_is_told_is_the_cause_and_no_other_is_sought(
+    seconds: float, is_late: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = load_session(SESSION)
+    summary, label = Summary(session), session.labels[0]
+    monkeypatch.setattr("mixpose.cli.findings.explanation", lambda *_: "T_sensor_world is off")
+    monkeypatch.setattr("mixpose.cli.findings.late_sensor", lambda *_: None)
+    delays = {"right": DelayEstimate(seconds, 5e-5)}
+    estimate = Estimate(0, None, label, "ambiguous", np.eye(4), np.eye(6), 1.0, {}, doubt=APART)
+    for frame in range(12):
+        summary.add(replace(estimate, frame=frame, delays=delays))
+    (line,) = summary.warnings()
+    assert ("as told below" in line) == is_late
+    assert ("T_sensor_world is off" in line) != is_late
+    assert len(summary.delay_remarks()) == is_late
 
 
 @pytest.mark.parametrize(

@@ -170,8 +170,12 @@ def sensor(name: str, offsets: Floats, J: Floats, met: Floats, count: float) -> 
     return Seen(J, name, offsets, met, count=count, unmatched_nearby=unmatched)
 
 
-def is_missed(sensors: Sequence[Seen], before: Floats = QUIET, agreed: bool = True) -> bool:
-    return is_seen_elsewhere(scored(np.eye(4), *sensors), before, agreed, RULES, MODEL)
+def is_missed(
+    sensors: Sequence[Seen], before: Floats = QUIET, agreed: bool = True, variance: float = 1e-4
+) -> bool:
+    pose = scored(np.eye(4), *sensors)
+    judged = replace(pose, variances=np.full(len(sensors), variance))
+    return is_seen_elsewhere(judged, before, agreed, RULES, MODEL)
 
 
 @pytest.fixture
@@ -200,6 +204,24 @@ def test_a_sensor_that_never_met_the_body_but_sees_as_much_is_not_believed(
     assert not is_missed([one, empty], np.zeros(2), False)
     # once they agreed, what is seen elsewhere may be anything
     assert not is_missed([one, empty])
+
+
+@pytest.mark.parametrize("agreed", [False, True])
+def test_what_a_sensor_meets_far_off_by_the_noise_of_the_frame_it_may_see_elsewhere(
+    jacobians: Floats, agreed: bool
+) -> None:
+    one, _ = seen(jacobians, [0.0, 0.0])
+    met = np.array([1.0] * 4 + [0.0] * 3)
+    rng = np.random.default_rng(2)
+    far, close = (
+        sensor("1", met[:, None] * size * rng.choice([-1.0, 1.0], (7, 2)), jacobians[1], met, 7.0)
+        for size in (0.9, 0.02)
+    )
+    assert is_missed([one, far], np.zeros(2), agreed)
+    # more than half of the body, as closely as the other sensor
+    assert not is_missed([one, close], np.zeros(2), agreed)
+    # or as the noise of the frame has it
+    assert not is_missed([one, far], np.zeros(2), agreed, variance=0.2)
 
 
 def test_one_sensor_of_four_is_not_believed_where_others_see_as_much_elsewhere(

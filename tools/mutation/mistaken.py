@@ -77,4 +77,20 @@ MUTANTS = (
         "two cameras of which one was turned agree about a wrong pose",
         ("test_turned_camera.py",),
     ),
+    Mutant(
+        "judgement-far-off-is-met",
+        "judgement/acceptance.py",
+        "off = np.where(is_off, used.shares, 0.0).sum(axis=1)",
+        "off = 0 * used.met",
+        "a sensor that meets the body far off by chance, and sees it elsewhere, agrees",
+        ("test_faults.py",),
+    ),
+    Mutant(
+        "judgement-noise-of-the-frame-is-far-off",
+        "judgement/acceptance.py",
+        "max(noise.get(name, 0.0), variance)",
+        "max(0.0, variance)",
+        "sensors that are off by as much as the noise of the frame seem to see the body elsewhere",
+        ("test_faults.py",),
+    ),
 )

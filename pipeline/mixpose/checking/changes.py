@@ -157,7 +157,7 @@ def _body_changes(body: Body) -> Iterator[Change]:
     mirror = np.array([1.0, 1.0, -1.0])
     mirrored = None if normals is None else normals * mirror
     yield Change(
-        "the body of [object] {is} mirrored",
+        "the body of [object] {is} mirrored, or seen in a mirror",
         "with one coordinate of all points negated",
         body=lambda body: of_points(body, middle + (body.means - middle) * mirror, mirrored),
     )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from statistics import median
@@ -22,7 +22,7 @@ from mixpose.cli.marker_offsets import BodySize, Marker
 from mixpose.frames.source import is_same, shown_by
 from mixpose.judgement import APART
 from mixpose.objective import View
-from mixpose.records import Estimate, FrameSet
+from mixpose.records import DelayEstimate, Estimate, FrameSet
 from mixpose.session import Session
 from mixpose.tracking import CHANGED, OUT_OF_STEP, TWICE, plane_views
 
@@ -34,6 +34,8 @@ _AT_LEAST = 0.2  # smallest residual for that, in sigma
 _USUAL = 100  # latest frames whose median residual is the usual one
 _KEPT = 3  # frames kept to be tried with changed sessions
 _SHOWN = 3  # stretches that are named in a message
+_SURELY_LATE = 6.0  # standard deviations
+_LATE_S = 5e-4  # smaller delays are rarely worth a key in the session
 
 
 @dataclass
@@ -97,6 +99,18 @@ class Findings:
         self._sizes = {label: BodySize(session, body.means) for label, body in self._bodies.items()}
         self._frames: list[tuple[int, list[View]]] = []
         self._agreed_before = 0
+        self.stated_delays = {setup.name: setup.delay for setup in session.sensors}
+        self.delays: Mapping[str, DelayEstimate] = {}  # of the last frame that has any
+
+    @property
+    def late(self) -> dict[str, float]:
+        """The stated delays of sensors whose estimated delay is surely another."""
+        return {
+            name: stated
+            for name, delay in self.delays.items()
+            if not isinstance(stated := self.stated_delays.get(name, 0.0), str)
+            and abs(delay.seconds) > max(_SURELY_LATE * delay.deviation, _LATE_S)
+        }
 
     def watch(self, frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
         """Record frames and features of the sensors; called before `add`."""
@@ -138,6 +152,7 @@ class Findings:
         """Add the estimate of a body in a frame to the statistics."""
         if estimate.label == self._session.labels[0]:
             self._places += 1
+        self.delays = estimate.delays or self.delays
         self._ok += estimate.status == "ok"
         self._lost += estimate.status == "lost"
         self._add_repeats(estimate)
@@ -227,7 +242,7 @@ class Findings:
             return [line]
         total, lines = self._places + 1, []
         hints = {
-            APART: f": {CAUSES}",
+            APART: ": one is out of step, as told below" if self.late else f": {CAUSES}",
             ASIDE: ": is a part of it hidden, or does it have more rows or fewer than told?",
         }
         if self._agreed_before:
@@ -284,7 +299,8 @@ class Findings:
         bad = self._places + 1 - self._ok - twice if doubted > twice or self._lost >= _LONG else 0
         if not few or bad < max(_LONG, self._repeat_count + 1) or len(self._session.labels) > 1:
             return None
-        explain = late_sensor if self._began_ok else explanation  # others would have shown earlier
+        # other causes would have shown earlier, or are not needed beside a delay
+        explain = late_sensor if self._began_ok or self.late else explanation
         return explain(self._session, self._frames)
 
     def _marker_lines(self) -> list[str]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # not needed to print a message
     from mixpose.calibration.task import Progress
-    from mixpose.records import DelayEstimate, Estimate
+    from mixpose.records import Estimate
     from mixpose.session import Session
 
 _NOTHING = 0.01  # share of a sensor's density that is explained: below it the sensor is idle
@@ -25,8 +25,6 @@ _OFTEN = 0.2  # share of the frames above which sensors are idle by turns for a 
 # are given as 25 in place of 24 mm
 _FAR_OFF = 0.5
 _EARLY = 10  # first frames: a warning if none of them is ok, as frames may take seconds each
-_SURELY_LATE = 6.0  # standard deviations
-_LATE_S = 5e-4  # smaller delays are rarely worth a key in the session
 _REMEMBERED = 10_000  # residuals kept of a camera: a live source may run for days
 
 _TIMED = 4  # frames whose times predict the duration of a search
@@ -108,14 +106,11 @@ class Summary:
         self.split_frames = 0
         self.left_out: Counter[tuple[str, str]] = Counter()  # sensors with reasons
         self.residuals = {name: deque[float](maxlen=_REMEMBERED) for name in self.sigmas}
-        self.stated_delays = {setup.name: setup.delay for setup in session.sensors}
-        self.delays: Mapping[str, DelayEstimate] = {}
 
     def add(self, estimate: Estimate) -> None:
         """Count a frame."""
         self.findings.add(estimate)
         self.statuses[estimate.status] += 1
-        self.delays = estimate.delays or self.delays
         count = sum(self.statuses.values())
         if count == _EARLY * self.bodies and not self.statuses["ok"]:
             warn(
@@ -185,7 +180,7 @@ class Summary:
             for name, off in offs.items()
             if off > _FAR_OFF * self.sigmas[name]
         ]
-        if far:
+        if far and not self.findings.late:
             warnings.append(
                 f"features are met far off, {' and '.join(far)}: is the size of [object], its "
                 "unit, the calibration or T_sensor_world wrong, are frames out of step, or are "
@@ -195,16 +190,15 @@ class Summary:
 
     def delay_remarks(self) -> list[str]:
         """Return remarks about delays of sensors that a moving body has shown."""
-        remarks = []
-        for name, delay in self.delays.items():
+        remarks, late = [], self.findings.late
+        for name, delay in self.findings.delays.items():
             spread = f"(give or take {2 * delay.deviation:.4f})"
-            stated = self.stated_delays.get(name, 0.0)
-            if stated == "estimate":
-                late = f"{delay.seconds:.4f} s {spread}"
-                remarks.append(f"sensor {name!r}: delay estimated as {late}")
-            elif abs(delay.seconds) > max(_SURELY_LATE * delay.deviation, _LATE_S):
+            if name not in late and self.findings.stated_delays.get(name) == "estimate":
+                estimated = f"{delay.seconds:.4f} s {spread}"
+                remarks.append(f"sensor {name!r}: delay estimated as {estimated}")
+            elif name in late:
                 kind = "late" if delay.seconds > 0 else "early"
-                whole = round(stated + delay.seconds, 4) + 0.0  # no minus zero
+                whole = round(late[name] + delay.seconds, 4) + 0.0  # no minus zero
                 remarks.append(
                     f"sensor {name!r} is {kind} by {abs(delay.seconds):.4f} s {spread}: "
                     f"delay = {whole:.4f} in its [[sensor]] takes it off"

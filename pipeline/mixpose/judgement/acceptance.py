@@ -329,9 +329,18 @@ def is_seen_elsewhere(
     used = judged.matches  # of sensors that are left out as well
     if len(used.images) < 2 or (used.dimensions != 2).any():
         return False
+    variance = min(_variance(before, model, model.errors.typical), model.usual**2)
+    v = variance + used.extra
+    # what is met far off, by the noise of this frame too, may as well be seen elsewhere
+    noise = dict(zip(judged.used.names, judged.variances.tolist(), strict=True))
+    least = [[max(noise.get(name, 0.0), variance)] for name in used.names]
+    is_off = model.errors.are_off(used, least + used.extra)
+    off = np.where(is_off, used.shares, 0.0).sum(axis=1)
+    met = used.met - off
+    coverage = used.coverage - off / np.maximum(used.expected + used.unseen, 1e-12)
     coverage, nearby, missed, count, met = (
         used.summed(values) / used.images
-        for values in (used.coverage, used.unmatched_nearby, used.missed, used.count, used.met)
+        for values in (coverage, used.unmatched_nearby + off, used.missed + off, used.count, met)
     )
     *_, second, first = sorted(range(len(coverage)), key=coverage.tolist().__getitem__)
     if not coverage[second] < rules.agreeing <= coverage[first]:
@@ -343,8 +352,6 @@ def is_seen_elsewhere(
     sees = (needed > 0) & (unmatched >= rules.agreeing * needed)
     sees[first] = False
     # odds that what a sensor meets is the body, against detections anywhere near
-    variance = _variance(before, model, model.errors.typical)
-    v = min(variance, model.usual**2) + used.extra
     odds = np.log(model.errors.met**2 / (2 * v)) - used.squared / (2 * v)
     odds = used.summed(np.vecdot(used.shares, odds) * used.coordinate_weight)
     return bool((odds[sees] < -rules.log_doubt).any())
