@@ -53,7 +53,8 @@ def test_two_faults_at_once_are_told_together(right: Session) -> None:
     frames = frames_of(right, swapped)[:2]
     assert diagnosis(mirrored(right), frames).change == (
         "'left' and 'right' are swapped, and the body of [object] is mirrored, or seen in a "
-        "mirror: with the source of each given to the other, and with one coordinate of all points negated"
+        "mirror: with the source of each given to the other, and with one coordinate of all "
+        "points negated"
     )
 
 
