@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from mixpose.body import Body, Gravity, PointFeature, SegmentFeature
 from mixpose.rigid import from_rotation_vector, transform
 from mixpose.sensors import CloudSensor, ParallelBeam, PinholeCamera, RangeSensor, Sensor
+from mixpose.simulation.motion import Shutter
 from mixpose.simulation.options import SimulationOptions
 from mixpose.simulation.render import ImageFormat, render_image
+from mixpose.simulation.scenery import Actor, Scenery
 from mixpose.simulation.visible_spots import View, displacements, facing, look
 
+Floats = NDArray[np.float64]
 K = np.array([[800.0, 0, 320], [0, 800, 256], [0, 0, 1]])
 CAMERA = PinholeCamera(K, resolution=(640, 512))
 T = from_rotation_vector([0.3, -0.2, 0.5], [10.0, -5.0, 900.0])
@@ -173,3 +179,26 @@ def test_spheres_are_seen_where_they_are_displaced_to() -> None:
     expected, _ = CAMERA.project(transform(T, POINTS + offsets))
     # centres of outlines are off those of spheres of 3 at 900 by 0.01 px
     np.testing.assert_allclose(seen.points, expected, atol=0.05)
+
+
+def test_a_mirror_image_is_read_at_the_moment_of_the_row_in_which_it_is_seen() -> None:
+    speed, readout, rows = np.array([300.0, 900.0, 0.0]), 0.03, 512
+
+    def pose(seconds: float) -> Floats:
+        return from_rotation_vector([0.3, -0.2, 0.5], np.array([10.0, -5, 900]) + seconds * speed)
+
+    upside_down = np.diag([1.0, -1.0, 1.0, 1.0])
+    image = Actor(BODY, pose, np.ones(8), upside_down, is_body_image=True)
+    shutter = Shutter(readout_s=readout, rows=rows)
+    view = replace(view_of(CAMERA), shutter=shutter, scenery=Scenery((image,)))
+    options, rng = SimulationOptions(1), np.random.default_rng(0)
+    seen = look(view, BODY, T, options, rng, pose_after=pose)
+    images = seen.points[seen.features >= len(BODY)]
+    assert len(images) == len(BODY)
+    moments = readout * (images[:, 1] / (rows - 1) - 0.5)
+    expected = [
+        CAMERA.project(transform(upside_down @ pose(seconds), point[None]))[0][0]
+        for seconds, point in zip(moments.tolist(), POINTS, strict=True)
+    ]
+    # the moment of the body's own row is up to 20 ms aside, 16 px
+    np.testing.assert_allclose(images, expected, atol=0.05)

@@ -159,11 +159,15 @@ class _Spots:
         """Add the spots of one feature, at each moment of the exposure."""
         view, body, sensor = self.view, actor.body, self.view.sensor
         has_size = sensor.dimension == 2 and body.radii is not None and body.radii[feature] > 0
-        poses = view.shutter.poses(sensor, body.means[feature], pose_after)
-        for pose in poses:
-            T = pose.copy()
+
+        def seen_after(seconds: float) -> Floats:
+            T = pose_after(seconds).copy()
             T[:3, 3] += T[:3, :3] @ offset
-            M = actor.seen_at(T)
+            return actor.seen_at(T)
+
+        # a mirror image is read where it is seen
+        motions = view.shutter.poses(sensor, body.means[feature], seen_after)
+        for M in motions:
             edge = outline(view.unbounded, body, feature, M) if has_size else None
             if edge is None:
                 y, shares = _spots(view, body.features[feature], M)
@@ -173,7 +177,7 @@ class _Spots:
                     continue
                 self.outlines[len(self.owners)] = edge
             self.points.append(y)
-            self.levels.append(actor.levels[feature] * shares / len(poses))
+            self.levels.append(actor.levels[feature] * shares / len(motions))
             self.owners += [owner] * len(y)
 
     def visible(self, occluders: tuple[Floats, ...]) -> VisibleSpots:
