@@ -90,7 +90,7 @@ def test_biases_that_are_held_as_exact_are_told_with_what_they_would_do() -> Non
     told = [line for line in lines_of(found, "mm") if line.startswith("held")]
     assert len(told) == 1
     # a bias of 5 mm moves a sensor about 5 mm along its line of sight, or more across
-    assert 5 <= found.moved_by_biases.max() < 30
+    assert 5 <= np.sqrt(found.of_biases.diagonal().max()) < 30
 
 
 def test_lenses_that_are_held_as_exact_are_told_with_what_they_would_do() -> None:
@@ -102,9 +102,9 @@ def test_lenses_that_are_held_as_exact_are_told_with_what_they_would_do() -> Non
     assert "size of the body, as exact; 1 % of it moves sensors by up to 11 mm" in of_size
     assert "0.1 % of the focal length and by 1 px of the principal point" in told
     # a pixel turns a line of sight by a thousandth, which is a millimetre of a metre or more
-    assert 0.5 < found.moved_by_lenses.max() < 5
+    assert 0.5 < np.sqrt(found.of_lenses.diagonal().max()) < 5
     freed = task_of(sensors, frames, 1.0, free=dict.fromkeys(range(2), ("pose", "focal")))
-    assert not calibrate(freed, NO_FRAME_HELD_BACK).moved_by_lenses.any()
+    assert not calibrate(freed, NO_FRAME_HELD_BACK).of_lenses.any()
 
 
 def test_of_three_cameras_two_of_which_were_bumped_none_is_named() -> None:

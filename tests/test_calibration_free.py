@@ -242,8 +242,12 @@ def test_what_the_known_length_errs_by_is_in_all_deviations() -> None:
     for _ in range(4):  # one error of the rig, small enough to be linear, and what comes of it
         error = 1e-6 * rng.normal(size=13)
         off = replace(found, after=rig_moved(found.after, found.blocks, error))
-        one = replace(found, covariance=np.outer(error, error), deviations=np.abs(error))
-        told = in_length(one, words).deviations
+        C = np.outer(error, error)
+        one = replace(found, covariance=C, of_lenses=4 * C, deviations=np.abs(error))
+        in_length_now = in_length(one, words)
+        told, by_lenses = in_length_now.deviations, in_length_now.of_lenses.diagonal()
+        # what held parameters do is told in the same units
+        assert np.sqrt(by_lenses) == pytest.approx(2 * told, rel=1e-6, abs=1e-12)
         rigs: list[Any] = [in_length(each, words).after.sensors for each in (found, off)]
         for block in found.blocks[:2]:
             T, T_off = (rig[block.sensor].T_sensor_world for rig in rigs)
@@ -282,7 +286,10 @@ def test_deviations_in_the_frame_of_a_sensor_know_how_that_errs() -> None:
         task_of(sensors, frames, free=free, known=poses), NO_FRAME_HELD_BACK, found=known
     )
     step = 1e-3 * np.random.default_rng(3).normal(0, 1, 15) * np.repeat([1, 1e-3, 1, 1e-3, 1], 3)
-    told = in_world(replace(found, covariance=np.outer(step, step)), "s1").deviations
+    C = np.outer(step, step)
+    in_s1 = in_world(replace(found, covariance=C, of_biases=9 * C), "s1")
+    told = in_s1.deviations
+    assert np.sqrt(in_s1.of_biases.diagonal().clip(0)) == pytest.approx(3 * told, abs=1e-9)
     off = in_world(replace(found, after=rig_moved(found.after, found.blocks, step)), "s1").after
     here = in_world(found, "s1").after
     a, b = (rig.sensors[0].T_sensor_world for rig in (off, here))  # type: ignore[attr-defined]

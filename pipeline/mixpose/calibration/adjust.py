@@ -132,10 +132,10 @@ def final_weights(
     return _weighted_pairs(bundle, state, bundle.rules.blur * noise, noise, last=True)
 
 
-def deviations_by_held(bundle: Bundle, adjusted: Adjusted) -> Floats:
-    """Return standard deviations (G,) of the rig's parameters by errors of held parameters."""
+def covariance_by_held(bundle: Bundle, adjusted: Adjusted) -> Floats:
+    """Return the covariance (G, G) of the rig's parameters by errors of held parameters."""
     weighted, _ = final_weights(bundle, adjusted.state, adjusted.noise)
-    return np.asarray(np.sqrt(np.diag(solve_step(bundle, adjusted.state, weighted).of_held)))
+    return solve_step(bundle, adjusted.state, weighted).of_held
 
 
 def _weighted_pairs(

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from mixpose.calibration import result
-from mixpose.calibration.adjust import Adjusted, adjust, deviations_by_held, fit_pairs
+from mixpose.calibration.adjust import Adjusted, adjust, covariance_by_held, fit_pairs
 from mixpose.calibration.bundle import Bundle
 from mixpose.calibration.gauge import gauge_rows
 from mixpose.calibration.latecomers import place_camera
@@ -297,8 +297,8 @@ class _Run:
         adjusted = adjust(self._bundle(start), start.state, blurs=blurs)
         return replace(start, state=adjusted.state), adjusted
 
-    def _moved_by(self, kind: Kind, start: Start, adjusted: Adjusted) -> Floats:
-        """Return how far errors of a held kind move the parameters (G,), where none is stated."""
+    def _of_held(self, kind: Kind, start: Start, adjusted: Adjusted) -> Floats:
+        """Return the covariance (G, G) by errors of a held kind, where none is stated."""
         task, lens = self._task, result.HELD_LENS
         errors = {
             s: lens if kind == "focal" else CalibrationError(range_bias=float(task.sigmas[s]))
@@ -307,8 +307,8 @@ class _Run:
             if s not in task.errors
         }
         if not errors:
-            return np.zeros(sum(len(block.names) for block in self._blocks))
-        return deviations_by_held(replace(self._bundle(start), errors=errors), adjusted)
+            return np.zeros(adjusted.covariance.shape)
+        return covariance_by_held(replace(self._bundle(start), errors=errors), adjusted)
 
     def _summarised(self, start: Start, adjusted: Adjusted, bad: list[int]) -> result.Calibration:
         task, rig = self._task, adjusted.state.rig
@@ -330,8 +330,8 @@ class _Run:
             noise=adjusted.noise,
             inflation=adjusted.inflation,
             certainty=adjusted.certainty,
-            moved_by_biases=self._moved_by("range_bias", start, adjusted),
-            moved_by_lenses=self._moved_by("focal", start, adjusted),
+            of_biases=self._of_held("range_bias", start, adjusted),
+            of_lenses=self._of_held("focal", start, adjusted),
             explained=result.explained_share(adjusted, start.frames, task),
             met=result.met_detections(adjusted, numbers),
             poses=dict(zip(numbers, adjusted.state.poses, strict=True)),

@@ -8,7 +8,7 @@ the consensus of all.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -67,10 +67,10 @@ class Calibration:
     noise: Floats  # (L,)
     inflation: float
     certainty: float  # as of `Adjusted`: near 1, unless features cannot be told apart
-    # (G,): standard deviations by held parameters whose errors are not stated: biases of ranges as
-    # large as σ_ε, and lenses that are off by `HELD_LENS`
-    moved_by_biases: Floats
-    moved_by_lenses: Floats
+    # (G, G): covariances by held parameters whose errors are not stated: biases of ranges as large
+    # as σ_ε, and lenses that are off by `HELD_LENS`
+    of_biases: Floats
+    of_lenses: Floats
     explained: Floats  # (L,): share of detections met, as of `explained_share`
     met: Mapping[int, MetDetections]  # by sensor
     poses: Mapping[int, Floats]  # (4, 4), by frame number
@@ -86,6 +86,19 @@ class Calibration:
             shared = [group for group in groups if group & frames]
             groups = [group for group in groups if not group & frames] + [frames.union(*shared)]
         return len(groups) == 1
+
+    def linear(self, by_old: Floats) -> Calibration:
+        """Return the calibration of parameters that are linear (G, G) in those of this one."""
+        covariances = (self.covariance, self.of_biases, self.of_lenses)
+        covariance, of_biases, of_lenses = (by_old @ C @ by_old.T for C in covariances)
+        deviations = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
+        return replace(
+            self,
+            covariance=covariance,
+            deviations=np.where(np.isfinite(self.deviations), deviations, np.inf),
+            of_biases=of_biases,
+            of_lenses=of_lenses,
+        )
 
     def doubtful(self, rules: CalibrationRules) -> tuple[int, ...]:
         """Return sensors that probably stand elsewhere, as their detections are not explained."""

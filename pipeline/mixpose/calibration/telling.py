@@ -49,7 +49,8 @@ def _plus_minus(deviation: float, unit: str) -> str:
 def _held_lines(calibration: Calibration, unit: str) -> list[str]:
     """Name held errors that would move a parameter by more than its reported deviation."""
     lens, lines, deviations = HELD_LENS, list[str](), calibration.deviations
-    biases, lenses = calibration.moved_by_biases, calibration.moved_by_lenses
+    covariances = calibration.of_biases, calibration.of_lenses
+    biases, lenses = (np.sqrt(np.maximum(C.diagonal(), 0.0)) for C in covariances)
     is_length = np.array([u == "length" for block in calibration.blocks for u in block.units], bool)
     reported = np.where(np.isfinite(deviations) & is_length, deviations, np.inf)
     for moved, words, kind in (

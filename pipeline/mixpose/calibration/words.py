@@ -158,19 +158,11 @@ def in_length(calibration: Calibration, words: str) -> Calibration:
     share = factor / _distance(rig, pair)
     by_old = np.diag(sizes) - share * np.outer(change, by_distance)
     return replace(
-        _by_linear(calibration, by_old),
+        calibration.linear(by_old),
         before=_scaled(calibration.before, factor),
         after=_scaled(rig, factor),
         poses={number: _shifted(T, factor) for number, T in calibration.poses.items()},
     )
-
-
-def _by_linear(calibration: Calibration, by_old: Floats) -> Calibration:
-    """Return the calibration with deviations of parameters linear (G, G) in the old ones."""
-    covariance = by_old @ calibration.covariance @ by_old.T
-    deviations = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
-    deviations = np.where(np.isfinite(calibration.deviations), deviations, np.inf)
-    return replace(calibration, covariance=covariance, deviations=deviations)
 
 
 def _scaled(rig: Rig, factor: float) -> Rig:
@@ -216,7 +208,7 @@ def in_world(calibration: Calibration, words: str) -> Calibration:
             change = sensor_change(sensors[index])[:, :6]
             by_old[block.place, reference.place] = change if block is not reference else 0.0
     return replace(
-        _by_linear(calibration, by_old),
+        calibration.linear(by_old),
         after=replace(calibration.after, sensors=sensors),
         poses={number: T_new_world @ T for number, T in calibration.poses.items()},
         gauge=(*calibration.gauge, f"the world is that of {words}"),
