@@ -76,13 +76,14 @@ class Future:
     """A task that is done, as a scheduler has it."""
 
     def __init__(self, key: str, function: Callable[[Any], Any], task: Any) -> None:
-        self.key, self._error, self._result = key, None, None
+        self.key, self._result = key, None
+        self._error: BaseException | None = None
         try:
             self._result = function(task)
-        except ValueError as error:
+        except BaseException as error:  # noqa: BLE001 - as a scheduler passes all of them on
             self._error = error
 
-    def exception(self) -> Exception | None:
+    def exception(self) -> BaseException | None:
         return self._error
 
     def result(self) -> Any:
@@ -136,3 +137,12 @@ def test_equal_tasks_have_a_result_each_also_on_a_cluster() -> None:
         results = dict(executor.run(int, ["7", "x", "7"]))
     assert (results[0], results[2]) == (7, 7)
     assert isinstance(results[1], ValueError)
+
+
+@pytest.mark.usefixtures("distributed")
+def test_an_interrupt_on_a_cluster_is_no_result() -> None:
+    def interrupted(_: str) -> int:
+        raise KeyboardInterrupt
+
+    with executing.executor(executing.LOCAL) as executor, pytest.raises(KeyboardInterrupt):
+        list(executor.run(interrupted, ["7"]))

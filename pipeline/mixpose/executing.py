@@ -47,10 +47,7 @@ class _Pool:
     ) -> Iterator[tuple[int, Result | Exception]]:
         numbers = {self._pool.submit(function, task): k for k, task in enumerate(tasks)}
         for future in futures.as_completed(numbers):
-            error = future.exception()
-            if error is not None and not isinstance(error, Exception):
-                raise error
-            yield numbers[future], future.result() if error is None else error
+            yield numbers[future], _outcome(future)
 
 
 class _Cluster:
@@ -67,8 +64,15 @@ class _Cluster:
         submitted = self._client.map(function, list(tasks), pure=False)
         numbers = {future.key: k for k, future in enumerate(submitted)}
         for future in as_completed(submitted):
-            error = future.exception()
-            yield numbers[future.key], future.result() if error is None else error
+            yield numbers[future.key], _outcome(future)
+
+
+def _outcome(future: Any) -> Any:
+    """Return the result of a task that ended, or its error; an interrupt is raised."""
+    error = future.exception()
+    if error is not None and not isinstance(error, Exception):
+        raise error
+    return future.result() if error is None else error
 
 
 @contextmanager

@@ -6,10 +6,12 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from itertools import islice, pairwise
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
+from mixpose.density import Observation
 from mixpose.errors import RecordingError
 from mixpose.frames import Source, numbers_of, prefetch, spread_over
 from mixpose.frames.images import ImageSequence
@@ -76,52 +78,74 @@ def survey(
     """
     quick = quick or (isinstance(source, Video) and source.size is None)
     damage: Damage = []
-    numbers, times, size = list[int](), dict[int, float](), None
-    counted, counts, features = list[int](), list[int](), dict[int, RawFrame]()
-    empty, doubled, repeated, before = list[int](), list[int](), list[int](), None
+    seen, before = _Seen(), None
     with closing(_frames(source, damage, quick=quick)) as frames:
         for frame in frames:
             number, data = frame.number, frame.data
-            numbers.append(number)
-            if frame.time_s is not None:
-                times[number] = frame.time_s
-            shown = shown_by(frame)
-            if shown is not None and shown.size < _TELLING:
-                shown = None
-            if shown is not None and shown.any() and is_same(before, shown):
-                repeated.append(number)
-            before = shown
-            if isinstance(data, np.ndarray):
-                size = (data.shape[1], data.shape[0])
-            elif isinstance(data, PointPattern) and has_duplicates(data.points):
-                doubled.append(number)
+            before = seen.add(frame, before)
             if not isinstance(data, np.ndarray) or to_count is None or number in to_count:
-                counted.append(number)
-                observation = observation_of(session, setup, frame)
-                pattern = observation.pattern
-                if isinstance(pattern, PointPattern):
-                    counts.append(observation.found)
-                    features[number] = replace(frame, data=pattern)
-                    is_empty = not observation.found
-                else:
-                    is_empty = not np.ptp(pattern.values)
-                if is_empty:
-                    empty.append(number)
+                seen.count(frame, observation_of(session, setup, frame))
             done()
+    counts = seen.counts
     return Survey(
-        numbers=tuple(numbers),
-        counted=tuple(counted),
-        counts=tuple(counts) if counts and len(counts) == len(counted) else None,
-        empty=tuple(empty),
-        size=size,
+        numbers=tuple(seen.numbers),
+        counted=tuple(seen.counted),
+        counts=tuple(counts) if counts and len(counts) == len(seen.counted) else None,
+        empty=tuple(seen.empty),
+        size=seen.size,
         damage=tuple(text for _, text in damage),
         damaged=tuple(number for number, _ in damage if number is not None),
         is_whole=not quick,
-        times=times,
-        repeated=tuple(repeated),
-        doubled=tuple(doubled),
-        features=features,
+        times=seen.times,
+        repeated=tuple(seen.repeated),
+        doubled=tuple(seen.doubled),
+        features=seen.features,
     )
+
+
+@dataclass
+class _Seen:
+    """What the frames of a sensor showed so far, for a `Survey`."""
+
+    numbers: list[int] = field(default_factory=list)
+    times: dict[int, float] = field(default_factory=dict)
+    size: tuple[int, int] | None = None
+    counted: list[int] = field(default_factory=list)
+    counts: list[int] = field(default_factory=list)
+    features: dict[int, RawFrame] = field(default_factory=dict)
+    empty: list[int] = field(default_factory=list)
+    doubled: list[int] = field(default_factory=list)
+    repeated: list[int] = field(default_factory=list)
+
+    def add(self, frame: RawFrame, before: NDArray[Any] | None) -> NDArray[Any] | None:
+        """Add a frame after one that showed `before`; return what this one shows, if it tells."""
+        number, data = frame.number, frame.data
+        self.numbers.append(number)
+        if frame.time_s is not None:
+            self.times[number] = frame.time_s
+        shown = shown_by(frame)
+        if shown is not None and shown.size < _TELLING:
+            shown = None
+        if shown is not None and shown.any() and is_same(before, shown):
+            self.repeated.append(number)
+        if isinstance(data, np.ndarray):
+            self.size = (data.shape[1], data.shape[0])
+        elif isinstance(data, PointPattern) and has_duplicates(data.points):
+            self.doubled.append(number)
+        return shown
+
+    def count(self, frame: RawFrame, observation: Observation) -> None:
+        """Add the features that were extracted from a frame."""
+        number, pattern = frame.number, observation.pattern
+        self.counted.append(number)
+        if isinstance(pattern, PointPattern):
+            self.counts.append(observation.found)
+            self.features[number] = replace(frame, data=pattern)
+            is_empty = not observation.found
+        else:
+            is_empty = not np.ptp(pattern.values)
+        if is_empty:
+            self.empty.append(number)
 
 
 def frames_to_count(sources: Mapping[str, Source]) -> set[int] | None:
