@@ -80,7 +80,7 @@ class Future:
         self._error: BaseException | None = None
         try:
             self._result = function(task)
-        except BaseException as error:  # noqa: BLE001 - as a scheduler passes all of them on
+        except BaseException as error:
             self._error = error
 
     def exception(self) -> BaseException | None:
