@@ -157,6 +157,7 @@ class SensorTable(Table):
     (`frame` or `time_s`, then `u,v`, `range` or `x,y,z`, and optionally `weight`), or range
     profiles (`.npy` or `.csv`, a row per frame); or what is live: the number of a camera, the
     address of a stream, a named pipe.  Tables with `time_s` alone are paired by nearest times.
+    Photographs are turned as their EXIF orientation says, as OpenCV and most calibration tools do.
     Example: `source = "left*.png"`"""
     times: str | None = Field(None, min_length=1, description="a CSV file: frame,time_s")
     """When frames were taken, in seconds: a table with a row for each frame, beside the session
