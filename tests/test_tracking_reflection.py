@@ -10,12 +10,14 @@ from detections import TRUTH, detect, view_of
 from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature, thickness
-from mixpose.fit import EstimatorOptions
+from mixpose.fit import EstimatorOptions, Fit
 from mixpose.judgement import Mistake
 from mixpose.rigid import perturb, transform
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
 from mixpose.tracking.doubt import reflection_mistake
+from mixpose.tracking.frame import Start
+from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.mirrors import MIRRORED as MIRROR_IMAGE
 
 Floats = NDArray[np.float64]
@@ -177,6 +179,20 @@ def test_of_a_pose_that_meets_nothing_as_sensors_stand_no_odds_of_a_mirror_are_a
     away = replace(best, T_world_object=perturb(TRUTH, np.array([40.0, 0, 0, 0, 0, 0])))
     assert reflection_mistake(data, best).log_odds != -np.inf
     assert not np.isnan(reflection_mistake(data, away).log_odds)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_of_two_features_that_are_met_no_other_tilt_is_asked(
+    pinhole_cameras: list[PinholeCamera], count: int
+) -> None:
+    few = Body("few", BODY.features[:count])
+    views = detect(pinhole_cameras, few, TRUTH, noise=0.05)
+    tracker = Tracker.create(BODY, EstimatorOptions())
+    asked = {MIRROR_IMAGE: Mistake(MIRROR_IMAGE, MIRROR_IMAGE, 1.0, 0.0)}
+    data = tracker.data(replace(tracker.begin(), mistaken=asked), 0, None, views)
+    judged = likelihood_of(data).judge(Fit(TRUTH), Start(TRUTH))
+    assert judged.features[0] == count
+    assert np.isfinite(reflection_mistake(data, judged).log_odds)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -327,8 +327,9 @@ def _log_odds_near(alone: _Alone, is_asked: bool, likely: float) -> float:
     rival = data.rival(judged, T, data.close_uncertainty, ahead=likely)
     starts = [rival, *([Start(T)] if is_asked else [])]
     odds = max([_evidence(mirror, start) for start in starts]) - judged.log_evidence
-    # at rest, late sensors meet moving bodies elsewhere
-    if is_asked and not data.is_timed and alone.evidence > -math.inf:
+    # at rest, late sensors meet moving bodies elsewhere; two features have no tilt
+    can_tilt = len(features) > 2 and not data.is_timed
+    if is_asked and can_tilt and alone.evidence > -math.inf:
         # with its depth reversed; the track followed the body, and not this one
         T_reversed = other_tilt(data.body, features, T, _across(judged))
         start = Start(T_reversed, alone.frame.close_uncertainty)
