@@ -181,6 +181,15 @@ def _centre_of_only_camera(data: Frame, best: ScoredPose) -> Floats | None:
 
 
 def _despite_loss(against: Sequence[Confusion], first: Frame, second: Frame) -> list[Confusion]:
-    """Return confusions of two bodies that may be each other, at least even if both were lost."""
-    least = math.log(0.5) if first.was_lost and second.was_lost else -math.inf
-    return [c._replace(log_odds=max(c.log_odds, min(least, c.alone))) for c in against]
+    """Return confusions of two bodies that may be each other, at most even.
+
+    Those that were lost may be either; of those that both missed frames as few are exchanged as
+    sessions are mistaken.
+    """
+    prior = -math.inf
+    if first.was_lost and second.was_lost:
+        prior = 0.0
+    elif first.track.misses and second.track.misses:
+        prior = math.log(first.rules.acceptance.mistaken)
+    even = math.log(0.5)
+    return [c._replace(log_odds=max(c.log_odds, min(even, prior + c.alone))) for c in against]
