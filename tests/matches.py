@@ -89,7 +89,8 @@ def matches_of(*sensors: Seen) -> Matches:
 
 def scored(T_world_object: Floats, *sensors: Seen) -> ScoredPose:
     """A pose that is very likely and well known, with these matches."""
-    return ScoredPose(T_world_object, matches_of(*sensors), 1e-6 * np.eye(6), 50.0)
+    ones, covariance = np.ones(len(sensors)), 1e-6 * np.eye(6)
+    return ScoredPose(T_world_object, matches_of(*sensors), covariance, 50.0, variances=ones)
 
 
 def _filled(one: Seen, most: int) -> tuple[Floats, Floats, Floats, Floats, Floats]:
