@@ -119,6 +119,29 @@ def test_of_three_bodies_each_may_be_where_the_one_before_it_is(are_seen: Sequen
         assert off(estimate, T)[0] < 2.0
 
 
+@pytest.mark.parametrize(("are_exchanged", "doubtful"), [(True, 2), (False, 0)])
+def test_bodies_that_differ_by_a_millimetre_and_come_back_exchanged_are_told_as_they_are(
+    are_exchanged: bool, doubtful: int
+) -> None:
+    moved = TOOL + np.array([[1.0, -0.5, 0.5], *[[0.0] * 3] * (len(TOOL) - 1)])
+    one, other = body("one", TOOL), body("other", moved)
+    scene, places = scene_of(one, other), [at(-80, 10), at(90, -20, 30, 1.1)]
+    tracks, told = scene.begin(), list[list[Estimate]]()
+    for frame in range(16):
+        if frame == 9 and are_exchanged:
+            places.reverse()
+        seen = [] if 6 <= frame < 9 else [one, other]
+        views = views_of(seen, places[: len(seen)], frame)
+        tracks, estimates = scene.advance(tracks, frame, None, views)
+        told.append(estimates)
+        for estimate, T in zip(estimates, places, strict=True):
+            assert estimate.status != "ok" or off(estimate, T)[0] < 2.0
+    statuses = [[estimate.status for estimate in estimates] for estimates in told]
+    # before, and from two frames after it on
+    assert statuses[:6] == [["ok"] * 2] * 6
+    assert statuses[9:] == [["ambiguous"] * 2] * doubtful + [["ok"] * 2] * (7 - doubtful)
+
+
 def test_where_a_body_may_be_the_other_one_that_comes_later_may_be_it_as_well() -> None:
     """What is known of the first one's place is known of whichever of the two it is."""
     one = body("one", np.vstack([TOOL[:4], [[70.0, 60.0, 50.0]]]))

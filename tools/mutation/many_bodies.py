@@ -202,4 +202,12 @@ MUTANTS = (
         "a body that is seen whole may be the part of it that was followed",
         ("test_several_bodies_parts.py",),
     ),
+    Mutant(
+        "tracking-bodies-that-missed-a-frame-are-never-exchanged",
+        "tracking/confusion.py",
+        "prior = math.log(first.rules.acceptance.mistaken)",
+        "pass",
+        "two bodies that differ by little and come back exchanged are ok as the other one",
+        ("test_several_bodies_parts.py",),
+    ),
 )
