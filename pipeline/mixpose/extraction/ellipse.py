@@ -23,13 +23,7 @@ from numpy.typing import NDArray
 
 from mixpose.constants import constant
 from mixpose.extraction.background import Grey
-from mixpose.extraction.conics import (
-    FEWEST,
-    Ellipses,
-    distances,
-    fit_conics,
-    rotations,
-)
+from mixpose.extraction.conics import FEWEST, Ellipses, distances, fit_conics, rotations
 from mixpose.extraction.contours import Contour
 from mixpose.extraction.sampling import sample_lines
 from mixpose.records import Floats, Indices, Mask, Singles

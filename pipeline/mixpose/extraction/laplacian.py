@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 
 import cv2
 import numpy as np
@@ -94,12 +93,10 @@ def _find(image: Image, options: ExtractOptions) -> Floats:
         heights = strength[places[:, 0], places[:, 1]]
         places = places[heights >= LOG.faint * heights.max(initial=0)]
     starts = places[:, ::-1].astype(np.float64)
-    is_round = partial(_is_round, LOG.oblong)
-    spots, _ = stationary_points(strength, starts, is_round, max(LOG.step * width, 1.0))
-    return spots
+    return stationary_points(strength, starts, _is_round, max(LOG.step * width, 1.0))[0]
 
 
-def _is_round(oblong: float, uu: Floats, uv: Floats, vv: Floats) -> NDArray[np.bool_]:
+def _is_round(uu: Floats, uv: Floats, vv: Floats) -> NDArray[np.bool_]:
     """Test whether a quadratic has a maximum that is no ridge."""
     trace, determinant = uu + vv, uu * vv - uv * uv / 4
-    return (trace < 0) & (trace**2 < (oblong + 1) ** 2 / oblong * determinant)
+    return (trace < 0) & (trace**2 < (LOG.oblong + 1) ** 2 / LOG.oblong * determinant)

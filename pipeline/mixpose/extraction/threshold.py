@@ -15,12 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.constants import constant
-from mixpose.extraction.background import (
-    Grey,
-    background_tiles,
-    interpolated,
-    noise_of,
-)
+from mixpose.extraction.background import Grey, background_tiles, interpolated, noise_of
 from mixpose.extraction.options import ExtractOptions
 from mixpose.records import Image
 

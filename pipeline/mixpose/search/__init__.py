@@ -34,7 +34,4 @@ from mixpose.search.three_points import (
     align_triples as align_triples,
     depths as depths,
 )
-from mixpose.search.triples import (
-    far_apart as far_apart,
-    thinned as thinned,
-)
+from mixpose.search.triples import far_apart as far_apart, thinned as thinned

@@ -41,7 +41,6 @@ from mixpose.search.problem import (
     SearchProblem,
     SensorDetections,
     is_pointlike,
-    largest_error,
     sensor_detections,
 )
 from mixpose.sensors import Rays
@@ -84,8 +83,8 @@ class SeenTogether:
     @cached_property
     def _cameras(self) -> list[tuple[SensorDetections, Rays, float]]:
         """Sensors with lines of sight, and the largest errors of their detections."""
-        reach = partial(largest_error, rules=self.rules)
-        return [(sensor, sensor.rays, reach(sensor)) for sensor in self.detections if sensor.rays]
+        sensors = [(sensor, sensor.rays) for sensor in self.detections if sensor.rays]
+        return [(sensor, rays, sensor.reach(self.rules)) for sensor, rays in sensors]
 
     @cached_property
     def points(self) -> TriangulatedPoints | None:

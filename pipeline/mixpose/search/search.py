@@ -27,13 +27,7 @@ from mixpose.search.poses import (
     matches_of,
     spread_poses,
 )
-from mixpose.search.problem import (
-    THOROUGH,
-    SearchBudget,
-    SearchProblem,
-    can_fix,
-    sensor_detections,
-)
+from mixpose.search.problem import THOROUGH, SearchBudget, SearchProblem, can_fix, sensor_detections
 from mixpose.search.three_points import Guesses
 from mixpose.search.triples import thinned
 

@@ -15,14 +15,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from mixpose.body import (
-    Body,
-    like_features,
-    mirror_image,
-    reflection,
-    thickness,
-    tolerance_of,
-)
+from mixpose.body import Body, like_features, mirror_image, reflection, thickness, tolerance_of
 from mixpose.body.symmetry import motions
 from mixpose.judgement import ScoredPose
 from mixpose.records import Floats

@@ -30,7 +30,7 @@ from mixpose.search import (
     search_frame,
     thinned,
 )
-from mixpose.tracking.frame import Frame, Start
+from mixpose.tracking.frame import Frame, Start, gains_by
 from mixpose.tracking.ranges import are_associated
 from mixpose.tracking.track import likely_branches
 
@@ -70,7 +70,7 @@ def is_doubtful(frame: Frame, ranked: Sequence[ScoredPose]) -> bool:
         return odds > rules.acceptance.log_doubt
     is_new = track.ok_count < rules.proposals.believed
     is_far = bool(ranked) and _is_far(frame, ranked[0], is_new=is_new)
-    if frame.is_best_accepted(frame.criterion, ranked) and not is_far:
+    if frame.is_found_by(ranked) and not is_far:
         return False
     if not ranked or not is_sure(ranked[0], frame.free, rules.acceptance):
         return True
@@ -92,7 +92,7 @@ def _leaves_any(frame: Frame, pose: ScoredPose) -> bool:
 
 def is_convincing(frame: Frame, ranked: Sequence[ScoredPose]) -> bool:
     """Test whether the best pose convinces, or lies where expected and is not doubtful."""
-    return frame.is_best_accepted(frame.criterion, ranked) or not is_doubtful(frame, ranked)
+    return frame.is_found_by(ranked) or not is_doubtful(frame, ranked)
 
 
 def _is_far(frame: Frame, pose: ScoredPose, *, is_new: bool) -> bool:
@@ -209,7 +209,7 @@ def candidates_of(frame: Frame) -> list[Candidate]:
         T_reference=frame.T_reference,
         rules=frame.rules.judgement,
         seed=frame.options.seed,
-        log_prior=frame.gains,
+        log_prior=lambda poses: np.asarray(gains_by([frame], poses)[0]),
     )
     among_moving, spent = list[Candidate](), SearchReport()
     moving = frame.track.clutter.without(frame.views, frame.rules.proposals.static)
