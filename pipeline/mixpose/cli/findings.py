@@ -85,7 +85,7 @@ class Findings:
         self._places = -1
         self._ok = self._lost = 0
         self._setups = {setup.name: setup for setup in session.sensors}
-        self._bodies = {label: setup.body for setup in session.objects for label in setup.labels}
+        self._bodies = session.bodies
         stretches = [{name: Stretches() for name in self._setups} for _ in range(5)]
         self._no_frame, self._no_feature, self._flooded, self._repeated, self._far = stretches
         self._most = dict.fromkeys(self._setups, 0)  # features of one frame

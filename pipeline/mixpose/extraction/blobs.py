@@ -41,8 +41,7 @@ from mixpose.extraction.contours import (
 from mixpose.extraction.ellipse import RIMS, are_waisted, find_rims
 from mixpose.extraction.options import ExtractOptions
 from mixpose.extraction.shape import centre_errors
-from mixpose.extraction.single_spots import find_spots_together
-from mixpose.extraction.spots import SPOTS, split_long
+from mixpose.extraction.spots import SPOTS, find_spots_together, split_long
 from mixpose.extraction.threshold import Foreground, Window, above, foreground
 from mixpose.records import Image, PointPattern
 

@@ -35,9 +35,9 @@ from mixpose.judgement.judge import (
     judge as judge,
     judge_together as judge_together,
 )
-from mixpose.judgement.expected import expected_covariance as expected_covariance
 from mixpose.judgement.clutter import ClutterRates as ClutterRates
 from mixpose.judgement.information import (
+    expected_covariance as expected_covariance,
     invert_information as invert_information,
     inverted as inverted,
 )

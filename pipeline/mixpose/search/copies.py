@@ -172,10 +172,7 @@ def _candidates(
 
 
 def _near_triples(points: TriangulatedPoints, longest: float, limit: int) -> Indices:
-    """Return triples (K, 3) of points that share no ray and may be within `longest` of each other.
-
-    The most promising come first; there are `limit` at most.
-    """
+    """Return the first `limit` triples (K, 3) of points within `longest` that share no ray."""
     pairs = cKDTree(points.points).query_pairs(2 * longest, output_type="ndarray")
     distances = np.linalg.norm(np.subtract(*points.points[pairs.T]), axis=1)
     pairs = pairs[distances < longest + points.tolerance[pairs].sum(axis=1)]

@@ -249,10 +249,7 @@ def _most_tried(data: Frame, views: Sequence[View]) -> dict[str, int]:
 
 
 def _sure_pose_by(data: Frame, views: Sequence[View]) -> ScoredPose | None:
-    """Return a pose that is sure by some views alone; else None.
-
-    These see nothing of the best pose, so that either sensor may be out of step.
-    """
+    """Return a pose that is sure by views alone that see nothing of the best pose; else None."""
     together = SeenTogether(views, data.rules.judgement, data.rules.search)
     alone = data.alone(views=views, static_views=(), starts=()).changed(options=data.options)
     return next(_sure_poses(alone, together), None)
