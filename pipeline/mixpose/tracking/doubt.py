@@ -121,10 +121,7 @@ def _contrast(a: ScoredPose, b: ScoredPose) -> str:
 
 
 def _are_alike(a: ScoredPose, b: ScoredPose) -> bool:
-    """Test whether two poses of a frame share at least half of the detections of the first.
-
-    Such poses are two tilts of one body, and none is in a mirror.
-    """
+    """Test whether poses share half of the first's detections: two tilts, and none in a mirror."""
     if a.matches.names != b.matches.names:
         return False
     pairs = zip(a.matches.detections, b.matches.detections, strict=True)

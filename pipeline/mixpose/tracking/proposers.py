@@ -159,10 +159,7 @@ def _is_wide(frame: Frame, T_world_object: Floats, uncertainty: Floats) -> bool:
 
 
 def _around(frame: Frame, T_world_object: Floats, wide: Floats, kept: int) -> list[Start]:
-    """Return starts to which poses drawn around one with standard deviations (6,) descend.
-
-    At most `kept` that meet anything, the best first.
-    """
+    """Return starts, `kept` at most, to which poses drawn around one descend, the best first."""
     rules, sigmas = frame.rules.proposals, np.array(frame.sigmas)
     narrow = wide / rules.narrowing
     stages = [

@@ -206,10 +206,7 @@ def _log_odds_of_match(data: Frame) -> float:
 
 
 def _second_pose(data: Frame, best: ScoredPose, leftover: SeenTogether) -> ScoredPose | None:
-    """Return a pose, sure by itself, that may be the body as well as the best one; else None.
-
-    As many sensors agree about it as about the best one, two at most.
-    """
+    """Return a sure pose that as many sensors meet as the best one, two at most; else None."""
     agree = min(int(np.count_nonzero(best.used.met)), 2)
     least = data.rules.acceptance.log_doubt
     alone = data.alone(views=leftover.views, static_views=(), starts=())
