@@ -314,7 +314,9 @@ def _log_odds_near(alone: _Alone, is_asked: bool, likely: float) -> float:
     # at rest, late sensors meet moving bodies elsewhere
     if is_asked and not data.is_timed and alone.evidence > -math.inf:
         # with its depth reversed; the track followed the body, and not this one
-        T_reversed = other_tilt(data.body, features, T, _across(judged))
+        by_shift = judged.used.J[..., :3].reshape(-1, 3)
+        across = np.linalg.eigh(by_shift.T @ by_shift)[1][:, 0]  # in which shifts are seen least
+        T_reversed = other_tilt(data.body, features, T, across)
         start = Start(T_reversed, alone.frame.close_uncertainty)
         odds = max(odds, _evidence(_reflected_frame(alone.frame, features), start) - alone.evidence)
     return odds
@@ -328,12 +330,6 @@ def _log_odds_anywhere(alone: _Alone) -> Iterator[float]:
     rivals = [rival for rival in candidates_of(mirror) if rival.evidence > least]
     for start in starts_at(mirror, rivals):
         yield _evidence(mirror, start) - alone.evidence
-
-
-def _across(judged: ScoredPose) -> Floats:
-    """Return the direction (3,) in the world in which sensors see least of a shift."""
-    by_shift = judged.used.J[..., :3].reshape(-1, 3)
-    return np.asarray(np.linalg.eigh(by_shift.T @ by_shift)[1][:, 0])
 
 
 def _is_by_chance(data: Frame, judged: ScoredPose) -> bool:

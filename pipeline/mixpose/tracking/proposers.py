@@ -106,17 +106,12 @@ def _is_far(frame: Frame, pose: ScoredPose, *, is_new: bool) -> bool:
     if pose.gained < rules.proposals.fallen * frame.track.gained:
         return True
     # much is met far off; or at an unexpected pose anything
-    share = _close(frame, pose)
+    shares = pose.used.shares
+    share = float(shares[_met_closely(frame, pose)].sum()) / max(float(shares.sum()), 1e-12)
     is_all = share * pose.coverage >= 1
     return share < rules.acceptance.convincing or not (
         is_all or frame.is_expected(pose.T_world_object)
     )
-
-
-def _close(frame: Frame, pose: ScoredPose) -> float:
-    """Return the share of met features that are as close as the noise of earlier frames allows."""
-    shares = pose.used.shares
-    return float(shares[_met_closely(frame, pose)].sum()) / max(float(shares.sum()), 1e-12)
 
 
 def _met_closely(frame: Frame, pose: ScoredPose) -> Mask:
@@ -146,16 +141,11 @@ def within(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     if first is None or first.spread is None or not _are_ranges(frame):
         return []
     uncertainty = np.where(frame.free, first.uncertainty, 0.0)
-    if not _is_wide(frame, first.T_world_object, uncertainty):
+    T, wide = first.T_world_object, uncertainty[None]
+    blurs = widest_blurs(frame.views, frame.body, T[None], wide, frame.rules.fit)
+    if not (blurs > frame.sigmas).any():  # features may be off by no more than σ_ε
         return []
-    return _around(frame, first.T_world_object, uncertainty, frame.rules.ranges.modes)
-
-
-def _is_wide(frame: Frame, T_world_object: Floats, uncertainty: Floats) -> bool:
-    """Test whether features may be off by more than σ_ε at a pose with standard deviations (6,)."""
-    arguments = T_world_object[None], uncertainty[None], frame.rules.fit
-    blurs = widest_blurs(frame.views, frame.body, *arguments)
-    return bool((blurs > frame.sigmas).any())
+    return _around(frame, T, uncertainty, frame.rules.ranges.modes)
 
 
 def _around(frame: Frame, T_world_object: Floats, wide: Floats, kept: int) -> list[Start]:
