@@ -188,11 +188,7 @@ def _find_spots(scene: Foreground, regions: Sequence[Region]) -> None:
     areas, levels = np.array([(region.area, region.level) for region in small]).reshape(-1, 2).T
     found_spots = find_spots_together(scene, contours, areas, levels)
     for region, spots in zip(small, found_spots, strict=True):
-        shape = length_by_width(region.contour) if len(spots) == 1 else (1.0, 0.0)
-        region.blobs = [
-            Blob(spot.u, spot.v, region.area / len(spots), *shape, error=spot.error, size=spot.size)
-            for spot in spots
-        ]
+        region.blobs = spots
 
 
 def _blobs_of(regions: Sequence[Region]) -> list[Blob]:

@@ -10,14 +10,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.constants import constant
-from mixpose.extraction.contours import Contour, is_on_border, mask_of, signal_about
+from mixpose.extraction.blob import Blob
+from mixpose.extraction.contours import (
+    Contour,
+    is_on_border,
+    length_by_width,
+    mask_of,
+    signal_about,
+)
 from mixpose.extraction.shape import Patches, areas_at_half_height, background, centroids
 from mixpose.extraction.threshold import Foreground, above
 from mixpose.records import Floats, Mask
@@ -52,20 +58,11 @@ class SpotRules:
 SPOTS = SpotRules()
 
 
-class Spot(NamedTuple):
-    """The centre of a small blob, its error, and its area."""
-
-    u: float  # centre, px of the window
-    v: float
-    error: float  # px, of the centre
-    size: float  # area in px at half of its height
-
-
-def find_spots(scene: Foreground, contour: Contour, area: float, level: float) -> list[Spot]:
-    """Return the spot of a small blob, or those of several blobs that touch in it.
+def find_spots(scene: Foreground, contour: Contour, area: float, level: float) -> list[Blob]:
+    """Return the spot of a small region, or those of several that touch in it.
 
     The contour encloses `area` px above the level.  There is no spot if the border of the window
-    cuts the blob, or it does not stand out.
+    cuts the region, or it does not stand out.
     """
     box = cv2.boundingRect(contour)
     u, v, width, height = box
@@ -87,6 +84,7 @@ def find_spots(scene: Foreground, contour: Contour, area: float, level: float) -
     parts = split_long(scene, contour, patch, inside, level)
     own_signal = patch if inside is None else patch * inside
     size = float(areas_at_half_height(own_signal[None], np.array([base]), np.array([peak]))[0])
+    shape, count = ((1.0, 0.0), len(parts)) if parts else (length_by_width(contour), 1)
     spots = []
     region: list[tuple[NDArray[np.uint8] | None, float]] = [(inside, level)]
     for part, valley in parts or region:
@@ -100,7 +98,7 @@ def find_spots(scene: Foreground, contour: Contour, area: float, level: float) -
             weights = above(patch, level) if part is None else part
         (centre,), (error,) = (values.tolist() for values in centroids(weights[None]))
         u, v = corner[0] + centre[0], corner[1] + centre[1]
-        spots.append(Spot(u, v, error, size / max(len(parts), 1)))
+        spots.append(Blob(u, v, area / count, *shape, error=error, size=size / count))
     return spots
 
 
@@ -149,22 +147,23 @@ def is_long(contour: Contour) -> bool:
 
 def find_spots_together(
     scene: Foreground, contours: Sequence[Contour], areas: Floats, levels: Floats
-) -> list[list[Spot]]:
-    """Return the `find_spots` of several small blobs, of areas (K,) above levels (K,)."""
-    spots: list[list[Spot]] = [[] for _ in contours]
+) -> list[list[Blob]]:
+    """Return the `find_spots` of several small regions, of areas (K,) above levels (K,)."""
+    spots: list[list[Blob]] = [[] for _ in contours]
     bright, candidates = _find_bright(scene, contours, levels)
     if len(candidates) >= FEWEST and float(levels.min()) > 0:
         indices, boxes = (np.array(column) for column in zip(*candidates, strict=True))
         *values, is_alone = _measure(scene, boxes, areas[indices], levels[indices])
-        lists = (column[is_alone].tolist() for column in (indices, *values))
-        for k, centre, error, size, stands_out in zip(*lists, strict=True):
+        lists = (column[is_alone].tolist() for column in (indices, areas[indices], *values))
+        for k, area, (u, v), error, size, stands_out in zip(*lists, strict=True):
             if not stands_out:
                 bright.remove(k)
             elif not (scene.is_selective and is_long(contours[k])):
                 bright.remove(k)
-                spots[k] = [Spot(centre[0], centre[1], error, size)]
+                shape = length_by_width(contours[k])
+                spots[k] = [Blob(u, v, area, *shape, error=error, size=size)]
     for k in bright:
-        spots[k] = find_spots(scene, contours[k], areas[k], float(levels[k]))
+        spots[k] = find_spots(scene, contours[k], float(areas[k]), float(levels[k]))
     return spots
 
 
