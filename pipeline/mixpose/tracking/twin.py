@@ -127,7 +127,7 @@ def leftover_of(pose: ScoredPose, data: Frame) -> SeenTogether:
         if len(is_left) and view.name in numbers and view.name not in pose.left_out:
             is_left[numbers[view.name][numbers[view.name] >= 0]] = False
         if is_left.any():
-            views.append(replace(view, observation=view.observation.only(is_left)))
+            views.append(view.only(is_left))
     return SeenTogether(views, data.rules.judgement, data.rules.search)
 
 
