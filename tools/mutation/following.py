@@ -306,8 +306,8 @@ _STATIC = (
     Mutant(
         "tracking-static-clutter-is-searched-first",
         "tracking/static_clutter.py",
-        "view if mask.all() else replace",
-        "view if True else replace",
+        "[view.only(mask) for view, mask in",
+        "[view for view, _ in",
         "a room full of lamps hides what comes into it",
         ("test_tracking_static.py",),
     ),

@@ -174,7 +174,7 @@ _SHAPES = (
     ),
     Mutant(
         "extraction-many-spots-swap-u-and-v",
-        "extraction/single_spots.py",
+        "extraction/spots.py",
         "centres + corners, errors",
         "centres + corners[:, ::-1], errors",
         "three spots and more are found at mirrored places",

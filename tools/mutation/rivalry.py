@@ -98,7 +98,7 @@ MUTANTS = (
     Mutant(
         "tracking-mirror-images-have-their-depth",
         "tracking/doubt.py",
-        "T_reversed = other_tilt(data.body, features, T, _across(judged))",
+        "T_reversed = other_tilt(data.body, features, T, across)",
         "T_reversed = T",
         "one camera sees a mirrored body from afar, and it is ok a quarter of a metre off",
         ("test_tracking_reflection.py",),

@@ -6,7 +6,7 @@ All is kept as sums and stretches of frames, so that a run of any length needs l
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -83,9 +83,9 @@ class Findings:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._places = -1
-        self._ok = self._lost = 0
+        self.statuses = Counter[str]()  # of all poses
         self._setups = {setup.name: setup for setup in session.sensors}
-        self._bodies = {label: setup.body for setup in session.objects for label in setup.labels}
+        self._bodies = session.bodies
         stretches = [{name: Stretches() for name in self._setups} for _ in range(5)]
         self._no_frame, self._no_feature, self._flooded, self._repeated, self._far = stretches
         self._most = dict.fromkeys(self._setups, 0)  # features of one frame
@@ -153,8 +153,7 @@ class Findings:
         if estimate.label == self._session.labels[0]:
             self._places += 1
         self.delays = estimate.delays or self.delays
-        self._ok += estimate.status == "ok"
-        self._lost += estimate.status == "lost"
+        self.statuses[estimate.status] += 1
         self._add_repeats(estimate)
         if estimate.doubt or estimate.status == "ambiguous":
             self._doubted.add(estimate.frame, self._places)
@@ -295,8 +294,9 @@ class Findings:
         # if most doubts are about a second body that looks alike, the session is not at fault
         twice = self._doubts.get(TWICE, Stretches()).count
         twice = twice if 2 * twice > doubted else 0
-        few = self._ok <= (self._places + 1) / 2
-        bad = self._places + 1 - self._ok - twice if doubted > twice or self._lost >= _LONG else 0
+        few = self.statuses["ok"] <= (self._places + 1) / 2
+        is_asked = doubted > twice or self.statuses["lost"] >= _LONG
+        bad = self._places + 1 - self.statuses["ok"] - twice if is_asked else 0
         if not few or bad < max(_LONG, self._repeat_count + 1) or len(self._session.labels) > 1:
             return None
         # other causes would have shown earlier, or are not needed beside a delay

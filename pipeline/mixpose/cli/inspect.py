@@ -44,7 +44,7 @@ def inspect_frame(request: InspectRequest) -> None:
         _, estimates = tracked.advance(tracked.begin(), number, frame_set.time_s, views)
     else:
         estimates = _from_file(pose_file, session, number)
-    bodies = [setup.body for setup in session.objects for _ in setup.instances]
+    bodies = [*session.bodies.values()]
     clouds = clouds_of(session)
     estimates = [with_clouds(estimate, clouds) for estimate in estimates]
     drawn = tuple(setup for setup in session.sensors if setup.name not in clouds)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import reduce
 from itertools import accumulate
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,26 +30,18 @@ _LEAST = 1e-3  # smallest change of size that is reported: such a body is measur
 _SEEN = 1e-3  # share of the effect of a change of size that no change of pose imitates
 
 
-@dataclass
-class _Sums:
+class _Sums(NamedTuple):
     """Sums over a stretch of frames that fit a displacement of a marker in the body's axes."""
 
     first: int  # frame
     met: int = 0  # frames in which the marker was met
     squares: float = 0.0  # weighted squares of offsets
     views: float = 0.0  # sum of weights
-    normal: Floats = field(default_factory=lambda: np.zeros((3, 3)))  # matrix of normal equations
-    pull: Floats = field(default_factory=lambda: np.zeros(3))  # their right-hand side
+    normal: Floats = np.zeros((3, 3))  # matrix of normal equations
+    pull: Floats = np.zeros(3)  # their right-hand side
 
-    def __add__(self, later: _Sums) -> _Sums:
-        return _Sums(
-            self.first,
-            self.met + later.met,
-            self.squares + later.squares,
-            self.views + later.views,
-            self.normal + later.normal,
-            self.pull + later.pull,
-        )
+    def plus(self, later: _Sums) -> _Sums:
+        return _Sums(self.first, *map(operator.add, self[1:], later[1:]))
 
     def shift(self) -> Floats:
         """Return the displacement (3,) in the body's axes that explains the offsets best."""
@@ -83,32 +76,33 @@ class Marker:
             self.missed_since += 1
             return
         self.since, self.missed_since = None, 0
-        sums = _Sums(frame, 1)
+        squares, views, normal, pull = 0.0, 0.0, np.zeros((3, 3)), np.zeros(3)
         for weight, offset, J in seen:
-            sums.squares += weight * float(offset @ offset)
-            sums.views += weight
-            sums.normal += weight * J.T @ J
-            sums.pull += weight * J.T @ offset
+            squares += weight * float(offset @ offset)
+            views += weight
+            normal += weight * J.T @ J
+            pull += weight * J.T @ offset
+        sums = _Sums(frame, 1, squares, views, normal, pull)
         if self.stretches and self.stretches[-1].met < self._longest:
-            self.stretches[-1] += sums
+            self.stretches[-1] = self.stretches[-1].plus(sums)
             return
         if len(self.stretches) == _KEPT:
             pairs = zip(self.stretches[::2], self.stretches[1::2], strict=True)
-            self.stretches = [earlier + later for earlier, later in pairs]
+            self.stretches = [earlier.plus(later) for earlier, later in pairs]
             self._longest *= 2
         self.stretches.append(sums)
 
     @property
     def whole(self) -> _Sums:
         """The sums over all frames."""
-        return reduce(_Sums.__add__, self.stretches, _Sums(0))
+        return reduce(_Sums.plus, self.stretches, _Sums(0))
 
     def displaced(self) -> tuple[_Sums, float]:
         """Return the final stretch in which it is displaced, and the variance that remains then.
 
         These are all frames, unless a displacement since one of them surely explains more.
         """
-        *ends, whole = accumulate(reversed(self.stretches), lambda later, sums: sums + later)
+        *ends, whole = accumulate(reversed(self.stretches), lambda later, sums: sums.plus(later))
         since = [end for end in ends if end.met >= _FEWEST <= whole.met - end.met]
         latest = max(since, key=_Sums.explained, default=whole)
         gain = latest.explained() - whole.explained()

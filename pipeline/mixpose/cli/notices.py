@@ -98,7 +98,7 @@ class Summary:
         self.findings, self.path = Findings(session), session.path
         self.bodies = len(session.labels)
         self.noun = "frames with a pose" if self.bodies == 1 else "poses"
-        self.statuses: Counter[str] = Counter()
+        self.statuses = self.findings.statuses
         self.posed: Counter[str] = Counter()
         self.idle: Counter[str] = Counter()
         self.shared = 0  # frames with a pose in which two sensors or more had features
@@ -110,7 +110,6 @@ class Summary:
     def add(self, estimate: Estimate) -> None:
         """Count a frame."""
         self.findings.add(estimate)
-        self.statuses[estimate.status] += 1
         count = sum(self.statuses.values())
         if count == _EARLY * self.bodies and not self.statuses["ok"]:
             warn(

@@ -5,15 +5,9 @@ from __future__ import annotations
 import json
 
 from mixpose import __version__
+from mixpose.cli import output
 from mixpose.cli.app import EvaluateRequest, ReportRequest
 from mixpose.cli.notices import counted, say, warn
-from mixpose.cli.output import (
-    print_lines,
-    refuse_suffix,
-    refuse_to_overwrite_but,
-    shown,
-    write_text,
-)
 from mixpose.poses.evaluate import evaluate
 from mixpose.poses.jsonl import read_poses, read_unfinished_poses
 from mixpose.poses.report import as_dict, as_table
@@ -27,19 +21,20 @@ def evaluate_poses(request: EvaluateRequest) -> None:
         if file.unit is None and errors.unit is not None:
             warn(f"{file.path}: no header says the unit of its lengths; taken for {errors.unit}")
     text = json.dumps(as_dict(errors), indent=2) if request.json else as_table(errors)
-    print_lines([text.rstrip("\n")])
+    output.print_lines([text.rstrip("\n")])
 
 
 def write_report(request: ReportRequest) -> None:
     """Write the report of a run to a page of its own, or to standard output."""
     from mixpose.report.page import MARK, find_session, render  # noqa: PLC0415 - only for pages
 
-    output = request.output
+    target = request.output
     poses, cut = read_unfinished_poses(request.poses)
     truth = None if request.truth is None else read_poses(request.truth)
-    refuse_to_overwrite_but(output, (request.poses, request.truth, find_session(poses).path), MARK)
+    inputs = request.poses, request.truth, find_session(poses).path
+    output.refuse_to_overwrite_but(target, inputs, MARK)
     reason = "a report is a page for a browser, which prints a PDF"
-    refuse_suffix(output, (".html", ".htm"), reason)
-    write_text(output, render(poses, truth, cut=cut, version=__version__), "-o")
+    output.refuse_suffix(target, (".html", ".htm"), reason)
+    output.write_text(target, render(poses, truth, cut=cut, version=__version__), "-o")
     frames = {line.frame for line in poses.poses}
-    say(f"{counted(len(frames), 'frame')} -> {shown(output)}")
+    say(f"{counted(len(frames), 'frame')} -> {output.shown(target)}")

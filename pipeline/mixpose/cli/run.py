@@ -92,7 +92,7 @@ def _watches(
     if request.publish:
         from mixpose.publishing import Publishing  # noqa: PLC0415 - only where it is published
 
-        bodies = [(label, setup.body) for setup in session.objects for label in setup.labels]
+        bodies = session.bodies.items()
         foresee = {label: _foresee(PosePredictor(body), ahead_s) for label, body in bodies}
         publishing = Publishing(request.publish, header, say, foresee if ahead_s else None, ahead_s)
         yield stack.enter_context(publishing).watch

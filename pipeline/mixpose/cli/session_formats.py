@@ -126,7 +126,7 @@ def trajectories_of(
 
 def _bodies(poses: PoseFile, lines: Sequence[PoseLine], session: Session) -> Mapping[str, Body]:
     """Return the bodies of lines by their labels, in the order of the session."""
-    bodies = {label: setup.body for setup in session.objects for label in setup.labels}
+    bodies = session.bodies
     labels = {line.label for line in lines}
     for label in labels - bodies.keys():
         raise SessionError(

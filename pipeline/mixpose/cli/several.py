@@ -265,11 +265,11 @@ def _write_summary(folder: Path, outcomes: Sequence[Outcome], total: int) -> Non
     }
     recording_job.write_json(folder / SUMMARY, summary)
     with appearing_whole(folder / TABLE) as part, part.open("w", encoding="utf-8", newline="") as f:
-        table = csv.writer(f, lineterminator="\n")
-        table.writerow(_COLUMNS)
+        table = csv.DictWriter(f, _COLUMNS, extrasaction="ignore", lineterminator="\n")
+        table.writeheader()
         for outcome in outcomes:
-            row = asdict(outcome) | {word: outcome.frames.get(word, 0) for word in _STATUSES}
-            table.writerow([row[column] for column in _COLUMNS])
+            counts = {word: outcome.frames.get(word, 0) for word in _STATUSES}
+            table.writerow(asdict(outcome) | counts)
 
 
 def _say_all(folder: Path, outcomes: Sequence[Outcome]) -> int:

@@ -41,8 +41,7 @@ from mixpose.extraction.contours import (
 from mixpose.extraction.ellipse import RIMS, are_waisted, find_rims
 from mixpose.extraction.options import ExtractOptions
 from mixpose.extraction.shape import centre_errors
-from mixpose.extraction.single_spots import find_spots_together
-from mixpose.extraction.spots import SPOTS, split_long
+from mixpose.extraction.spots import SPOTS, find_spots_together, split_long
 from mixpose.extraction.threshold import Foreground, Window, above, foreground
 from mixpose.records import Image, PointPattern
 
@@ -189,11 +188,7 @@ def _find_spots(scene: Foreground, regions: Sequence[Region]) -> None:
     areas, levels = np.array([(region.area, region.level) for region in small]).reshape(-1, 2).T
     found_spots = find_spots_together(scene, contours, areas, levels)
     for region, spots in zip(small, found_spots, strict=True):
-        shape = length_by_width(region.contour) if len(spots) == 1 else (1.0, 0.0)
-        region.blobs = [
-            Blob(spot.u, spot.v, region.area / len(spots), *shape, error=spot.error, size=spot.size)
-            for spot in spots
-        ]
+        region.blobs = spots
 
 
 def _blobs_of(regions: Sequence[Region]) -> list[Blob]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -61,16 +62,12 @@ def extract_corners(image: Image, options: ExtractOptions, window: Window) -> Po
     The threshold of the options is "auto", or the least difference of grey values between bright
     and dark fields; corners have neither polarity nor area.
     """
-
-    def find(part: Image) -> Floats:
-        if min(part.shape) <= 2 * CORNERS.margin:
-            return np.empty((0, 2))
-        return _find(part.astype(np.float32), options.threshold)
-
-    return points_in(image, window, find)
+    find = partial(_find, threshold=options.threshold)
+    return points_in(image, window, CORNERS.margin, find)
 
 
-def _find(grey: Grey, threshold: str | float) -> Floats:
+def _find(image: Image, threshold: str | float) -> Floats:
+    grey = image.astype(np.float32)
     blurred = cv2.GaussianBlur(grey, (0, 0), CORNERS.blur, borderType=cv2.BORDER_REPLICATE)
     # Rings are thin and sampled with little blur only; single pixels would be noisy.
     smooth = cv2.GaussianBlur(grey, (5, 5), 1.0, borderType=cv2.BORDER_REPLICATE)

@@ -41,13 +41,13 @@ def load_function(method: str, base: Path | None) -> UserFunction:
         module = _load_module(module_name, base)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
-            raise SessionError(_failed(method, "cannot be imported", error)) from error
+            raise _failed(method, "cannot be imported", error) from error
         where = "" if base is None else f" in {base} or"
         raise SessionError(
             f"extract.method: {method!r}: no module {module_name!r}{where} in Python's path"
         ) from error
     except Exception as error:
-        raise SessionError(_failed(method, "cannot be imported", error)) from error
+        raise _failed(method, "cannot be imported", error) from error
     function = getattr(module, function_name, None)
     if not callable(function):
         raise SessionError(
@@ -72,7 +72,7 @@ def extract_custom(
     except MixposeError:
         raise
     except Exception as error:
-        raise SessionError(_failed(options.method, "failed", error)) from error
+        raise _failed(options.method, "failed", error) from error
     corner = np.array([u0, v0], dtype=np.float64)
     if isinstance(result, GridPattern):
         return _checked_grid(result, options.method, corner)
@@ -87,52 +87,46 @@ def _checked_points(result: object, method: str, corner: np.ndarray[Any, Any]) -
     try:
         numbers = [np.asarray(column, dtype=np.float64) for column in columns]
     except (TypeError, ValueError):
-        raise SessionError(_wrong(method, f"returned {type(result).__name__}")) from None
+        raise _wrong(method, f"returned {type(result).__name__}") from None
     points = numbers[0]
     if points.size == 0:
         return PointPattern(np.empty((0, 2)), np.empty(0))
     widths = (2, 3) if len(numbers) == 1 else (2,)
     if points.ndim != 2 or points.shape[1] not in widths:
-        raise SessionError(_wrong(method, f"returned an array of shape {points.shape}"))
+        raise _wrong(method, f"returned an array of shape {points.shape}")
     if len(numbers) == 2:
         weights = numbers[1]
     else:
         weights = points[:, 2] if points.shape[1] == 3 else np.ones(len(points))
     if weights.shape != (len(points),):
-        raise SessionError(
-            _wrong(method, f"returned {len(points)} points and weights of shape {weights.shape}")
-        )
+        raise _wrong(method, f"returned {len(points)} points and weights of shape {weights.shape}")
     if not (np.isfinite(points).all() and np.isfinite(weights).all() and (weights > 0).all()):
-        raise SessionError(
-            _wrong(method, "returned NaN, infinite values, or weights that are not positive")
-        )
+        raise _wrong(method, "returned NaN, infinite values, or weights that are not positive")
     return PointPattern(points[:, :2] + corner, weights)
 
 
 def _checked_grid(grid: GridPattern, method: str, corner: np.ndarray[Any, Any]) -> GridPattern:
     values = np.asarray(grid.values)
     if values.ndim != 2 or not np.issubdtype(values.dtype, np.number):
-        raise SessionError(_wrong(method, f"returned grid values of shape {values.shape}"))
+        raise _wrong(method, f"returned grid values of shape {values.shape}")
     origin = np.asarray(grid.origin, dtype=np.float64)
     if origin.shape != (2,) or not np.isfinite(origin).all() or not grid.step > 0:
-        raise SessionError(
-            _wrong(method, f"returned a grid of origin {grid.origin} and step {grid.step}")
-        )
+        raise _wrong(method, f"returned a grid of origin {grid.origin} and step {grid.step}")
     if not np.isfinite(values).all() or values.min(initial=0) < 0:
-        raise SessionError(_wrong(method, "returned NaN, infinite or negative grid values"))
+        raise _wrong(method, "returned NaN, infinite or negative grid values")
     return GridPattern(values.astype(np.float32), origin + corner, float(grid.step))
 
 
-def _wrong(method: str, what: str) -> str:
-    return (
+def _wrong(method: str, what: str) -> SessionError:
+    return SessionError(
         f"extract.method: {method!r} {what}; allowed are a PointPattern, a GridPattern, or an"
         " array (M, 2) or (M, 3) of u, v and weight"
     )
 
 
-def _failed(method: str, what: str, error: Exception) -> str:
+def _failed(method: str, what: str, error: Exception) -> SessionError:
     reason = " ".join(str(error).split())
-    return f"extract.method: {method!r} {what}: {type(error).__name__}: {reason}"
+    return SessionError(f"extract.method: {method!r} {what}: {type(error).__name__}: {reason}")
 
 
 def _load_module(name: str, base: Path | None) -> ModuleType:

@@ -23,13 +23,7 @@ from numpy.typing import NDArray
 
 from mixpose.constants import constant
 from mixpose.extraction.background import Grey
-from mixpose.extraction.conics import (
-    FEWEST,
-    Ellipses,
-    distances,
-    fit_conics,
-    rotations,
-)
+from mixpose.extraction.conics import FEWEST, Ellipses, distances, fit_conics, rotations
 from mixpose.extraction.contours import Contour
 from mixpose.extraction.sampling import sample_lines
 from mixpose.records import Floats, Indices, Mask, Singles
@@ -93,8 +87,7 @@ class Rim(NamedTuple):
     residual: float  # RMS distance in px of these edges from it
 
 
-@dataclass(frozen=True)
-class Rims:
+class Rims(NamedTuple):
     """The rims of B features; rows without an ellipse where none fits."""
 
     ellipses: Ellipses
@@ -105,10 +98,8 @@ class Rims:
 
     def replaced(self, rows: Indices, others: Rims) -> Rims:
         """Return a copy with others in the given rows."""
-        old = self.coverage, self.residual, self.contrast, self.shift
-        new = others.coverage, others.residual, others.contrast, others.shift
-        arrays = [array.copy() for array in old]
-        for array, values in zip(arrays, new, strict=True):
+        arrays = [array.copy() for array in self[1:]]
+        for array, values in zip(arrays, others[1:], strict=True):
             array[rows] = values
         return Rims(self.ellipses.replaced(rows, others.ellipses), *arrays)
 
@@ -178,10 +169,7 @@ def _padded(points: Sequence[Contour]) -> tuple[Floats, Mask]:
 def _rims_near(
     signals: Sequence[Grey], which: Indices, starts: Ellipses, contrasts: Floats, min_share: float
 ) -> Rims:
-    """Fit rims to the edges near start ellipses.
-
-    Those with edges in less than a share `min_share` of the directions are not fitted.
-    """
+    """Fit rims to the edges near start ellipses, if in a share `min_share` of the directions."""
     edges, is_edge, steps, lows, offsets = _edges(signals, which, starts, contrasts)
     is_edge &= (is_edge.sum(axis=1) >= min_share * DIRECTIONS)[:, None]
     outside = lows - _medians(lows, is_edge)[:, None]

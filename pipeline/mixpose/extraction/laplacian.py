@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 
 import cv2
 import numpy as np
@@ -58,7 +57,9 @@ def extract_log(image: Image, options: ExtractOptions, window: Window) -> PointP
     Of the options, `spot_sigma` is the width of the spots in px, 0 for 3 px; `threshold` is "auto"
     or the least height of a spot above its surroundings, in grey values.  Areas are not used.
     """
-    return points_in(image, window, lambda part: _find(part, options))
+    width = options.spot_sigma or LOG.width
+    margin = math.ceil(LOG.margin * width)
+    return points_in(image, window, margin, lambda part: _find(part, options, width, margin))
 
 
 def spot_strength(image: Image, options: ExtractOptions) -> Grey:
@@ -74,13 +75,9 @@ def spot_strength(image: Image, options: ExtractOptions) -> Grey:
     return np.asarray(response * np.float32(sign * 2 * width**2))
 
 
-def _find(image: Image, options: ExtractOptions) -> Floats:
+def _find(image: Image, options: ExtractOptions, width: float, margin: int) -> Floats:
     from skimage.feature import peak_local_max  # noqa: PLC0415 (0.04 s to import)
 
-    width = options.spot_sigma or LOG.width
-    margin = math.ceil(LOG.margin * width)
-    if min(image.shape) <= 2 * margin:
-        return np.empty((0, 2))
     strength = spot_strength(image, options)
     min_height = LOG.noise_factor * 2 * noise_of(image) / (math.sqrt(2 * math.pi) * width)
     if not isinstance(options.threshold, str):
@@ -94,12 +91,10 @@ def _find(image: Image, options: ExtractOptions) -> Floats:
         heights = strength[places[:, 0], places[:, 1]]
         places = places[heights >= LOG.faint * heights.max(initial=0)]
     starts = places[:, ::-1].astype(np.float64)
-    is_round = partial(_is_round, LOG.oblong)
-    spots, _ = stationary_points(strength, starts, is_round, max(LOG.step * width, 1.0))
-    return spots
+    return stationary_points(strength, starts, _is_round, max(LOG.step * width, 1.0))[0]
 
 
-def _is_round(oblong: float, uu: Floats, uv: Floats, vv: Floats) -> NDArray[np.bool_]:
+def _is_round(uu: Floats, uv: Floats, vv: Floats) -> NDArray[np.bool_]:
     """Test whether a quadratic has a maximum that is no ridge."""
     trace, determinant = uu + vv, uu * vv - uv * uv / 4
-    return (trace < 0) & (trace**2 < (oblong + 1) ** 2 / oblong * determinant)
+    return (trace < 0) & (trace**2 < (LOG.oblong + 1) ** 2 / LOG.oblong * determinant)

@@ -20,13 +20,17 @@ FIT_STEPS = 3
 IsWanted = Callable[[Floats, Floats, Floats], NDArray[np.bool_]]
 
 
-def points_in(image: Image, window: Window, find: Callable[[Image], Floats]) -> PointPattern:
+def points_in(
+    image: Image, window: Window, margin: int, find: Callable[[Image], Floats]
+) -> PointPattern:
     """Return the points of `find` in a window (u0, v0, u1, v1), in pixels of the whole image.
 
-    `find` maps the image in the window, not empty, to points (n, 2) in its pixels.  Weights are 1.
+    `find` maps the image in the window to points (n, 2) in its pixels; there are none where the
+    window is no larger than a margin in px on each side.  Weights are 1.
     """
     u0, v0, u1, v1 = window
-    points = find(image[v0:v1, u0:u1])
+    part = image[v0:v1, u0:u1]
+    points = np.empty((0, 2)) if min(part.shape) <= 2 * margin else find(part)
     return PointPattern(points + np.array([u0, v0]), np.ones(len(points)))
 
 

@@ -1,18 +1,35 @@
-"""Locate small blobs by the centroid of their grey values, to hundredths of a pixel."""
+"""Locate small blobs by the centroid of their grey values, to hundredths of a pixel.
+
+The usual ones, which are small, round and alone, are located all at once, with the results of
+`find_spots`, in a few steps for all.  Weighted centroids of `skimage.measure.regionprops_table` are
+as good (0.012 to 0.013 px in `data/synthetic/two_cameras`), but take 3.1 ms per frame instead of
+0.5 ms.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.constants import constant
-from mixpose.extraction.contours import Contour, is_on_border, mask_of, signal_about
-from mixpose.extraction.shape import areas_at_half_height, background, centroids
+from mixpose.extraction.blob import Blob
+from mixpose.extraction.contours import (
+    Contour,
+    is_on_border,
+    length_by_width,
+    mask_of,
+    signal_about,
+)
+from mixpose.extraction.shape import Patches, areas_at_half_height, background, centroids
 from mixpose.extraction.threshold import Foreground, above
+from mixpose.records import Floats, Mask
+
+FEWEST = 3  # spots for which locating them all at once is faster
+WIDEST_PX = 15
 
 
 @dataclass(frozen=True)
@@ -41,20 +58,11 @@ class SpotRules:
 SPOTS = SpotRules()
 
 
-class Spot(NamedTuple):
-    """The centre of a small blob, its error, and its area."""
-
-    u: float  # centre, px of the window
-    v: float
-    error: float  # px, of the centre
-    size: float  # area in px at half of its height
-
-
-def find_spots(scene: Foreground, contour: Contour, area: float, level: float) -> list[Spot]:
-    """Return the spot of a small blob, or those of several blobs that touch in it.
+def find_spots(scene: Foreground, contour: Contour, area: float, level: float) -> list[Blob]:
+    """Return the spot of a small region, or those of several that touch in it.
 
     The contour encloses `area` px above the level.  There is no spot if the border of the window
-    cuts the blob, or it does not stand out.
+    cuts the region, or it does not stand out.
     """
     box = cv2.boundingRect(contour)
     u, v, width, height = box
@@ -76,6 +84,7 @@ def find_spots(scene: Foreground, contour: Contour, area: float, level: float) -
     parts = split_long(scene, contour, patch, inside, level)
     own_signal = patch if inside is None else patch * inside
     size = float(areas_at_half_height(own_signal[None], np.array([base]), np.array([peak]))[0])
+    shape, count = ((1.0, 0.0), len(parts)) if parts else (length_by_width(contour), 1)
     spots = []
     region: list[tuple[NDArray[np.uint8] | None, float]] = [(inside, level)]
     for part, valley in parts or region:
@@ -89,7 +98,7 @@ def find_spots(scene: Foreground, contour: Contour, area: float, level: float) -
             weights = above(patch, level) if part is None else part
         (centre,), (error,) = (values.tolist() for values in centroids(weights[None]))
         u, v = corner[0] + centre[0], corner[1] + centre[1]
-        spots.append(Spot(u, v, error, size / max(len(parts), 1)))
+        spots.append(Blob(u, v, area / count, *shape, error=error, size=size / count))
     return spots
 
 
@@ -134,3 +143,67 @@ def is_long(contour: Contour) -> bool:
     """Test whether a blob is so long that it may be several."""
     _, (a, b), _ = cv2.minAreaRect(contour)
     return bool(max(a, b) + 1 > SPOTS.long * (min(a, b) + 1))
+
+
+def find_spots_together(
+    scene: Foreground, contours: Sequence[Contour], areas: Floats, levels: Floats
+) -> list[list[Blob]]:
+    """Return the `find_spots` of several small regions, of areas (K,) above levels (K,)."""
+    spots: list[list[Blob]] = [[] for _ in contours]
+    bright, candidates = _find_bright(scene, contours, levels)
+    if len(candidates) >= FEWEST and float(levels.min()) > 0:
+        indices, boxes = (np.array(column) for column in zip(*candidates, strict=True))
+        *values, is_alone = _measure(scene, boxes, areas[indices], levels[indices])
+        lists = (column[is_alone].tolist() for column in (indices, areas[indices], *values))
+        for k, area, (u, v), error, size, stands_out in zip(*lists, strict=True):
+            if not stands_out:
+                bright.remove(k)
+            elif not (scene.is_selective and is_long(contours[k])):
+                bright.remove(k)
+                shape = length_by_width(contours[k])
+                spots[k] = [Blob(u, v, area, *shape, error=error, size=size)]
+    for k in bright:
+        spots[k] = find_spots(scene, contours[k], float(areas[k]), float(levels[k]))
+    return spots
+
+
+def _find_bright(
+    scene: Foreground, contours: Sequence[Contour], levels: Floats
+) -> tuple[set[int], list[tuple[int, tuple[int, int, int, int]]]]:
+    """Find contours bright enough for spots; of small ones away from the border also the boxes."""
+    rows, columns = scene.grey.shape
+    inner_v, inner_u = rows - WIDEST_PX - SPOTS.margin, columns - WIDEST_PX - SPOTS.margin
+    bright, candidates = set(), []
+    min_peaks = np.full(len(levels), scene.least_peak)
+    if scene.is_selective:
+        min_peaks = np.maximum(min_peaks, levels / (1 - SPOTS.prominence))
+    for k, (contour, lowest) in enumerate(
+        zip(contours, (min_peaks + scene.zero).tolist(), strict=True)
+    ):
+        u, v, width, height = cv2.boundingRect(contour)
+        highest = cv2.minMaxLoc(scene.grey[v : v + height, u : u + width])[1]
+        if highest >= lowest:
+            bright.add(k)
+            small = width <= WIDEST_PX and height <= WIDEST_PX
+            if small and SPOTS.margin <= u < inner_u and SPOTS.margin <= v < inner_v:
+                candidates.append((k, (u, v, width, height)))
+    return bright, candidates
+
+
+def _measure(
+    scene: Foreground, boxes: NDArray[np.intp], areas: Floats, levels: Floats
+) -> tuple[Floats, Floats, Floats, Mask, Mask]:
+    """Return centres (K, 2), errors, areas, which spots stand out, and which need no mask."""
+    signal, corners, base, peak = Patches.around(scene, boxes, SPOTS.margin)
+    level = levels.astype(np.float32)[:, None, None]
+    is_alone = (signal > level).reshape(len(boxes), -1).sum(axis=1) == areas
+    bright = np.ones(len(boxes), dtype=np.bool_)
+    if scene.is_selective:
+        bright = (peak - base >= SPOTS.min_step * peak) & (peak - levels >= SPOTS.prominence * peak)
+    base = np.minimum(base, levels)
+    sizes = areas_at_half_height(signal, base, peak)
+    cut = np.maximum(levels, base + SPOTS.centroid * (peak - base)).astype(np.float32)
+    weights = np.maximum(signal - cut[:, None, None], 0)
+    centres, errors = centroids(weights)
+    is_alone &= np.isfinite(errors)
+    return centres + corners, errors, sizes, bright, is_alone

@@ -35,11 +35,9 @@ from mixpose.judgement.judge import (
     judge as judge,
     judge_together as judge_together,
 )
-from mixpose.judgement.expected import (
-    expected_covariance as expected_covariance,
-)
 from mixpose.judgement.clutter import ClutterRates as ClutterRates
 from mixpose.judgement.information import (
+    expected_covariance as expected_covariance,
     invert_information as invert_information,
     inverted as inverted,
 )
@@ -55,7 +53,4 @@ from mixpose.judgement.mistakes import (
     possible_mistakes as possible_mistakes,
 )
 from mixpose.judgement.shape import Shape as Shape, shape_shown as shape_shown
-from mixpose.judgement.noise import (
-    NoiseModel as NoiseModel,
-    RememberedNoise as RememberedNoise,
-)
+from mixpose.judgement.noise import NoiseModel as NoiseModel, RememberedNoise as RememberedNoise

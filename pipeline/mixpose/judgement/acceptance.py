@@ -168,10 +168,14 @@ def decide(
     possible = [pose for pose in ranked if is_possible(pose, free)]
     if not possible:
         return Verdict(None, [])
-    best, odds = possible[0], _odds_against(possible[0], ranked, ahead_of)
+
+    def odds_against(best: ScoredPose) -> list[float]:
+        return [0.0 if pose is best else ahead_of(pose, best) for pose in ranked]
+
+    best, odds = possible[0], odds_against(possible[0])
     likeliest = max(possible, key=lambda pose: odds[ranked.index(pose)])
     if likeliest is not best:
-        best, odds = likeliest, _odds_against(likeliest, ranked, ahead_of)
+        best, odds = likeliest, odds_against(likeliest)
     weights = beliefs(odds)
     rivals = [log_odds for pose, log_odds in zip(ranked, odds, strict=True) if pose is not best]
     against = [Alternative("", log_odds) for log_odds in (-best.log_evidence, *rivals)]
@@ -192,15 +196,6 @@ def decide(
         if pose is not best and is_fixed(pose, free)
     ]
     return Verdict(best, kept, tuple(faint), tuple(against), rules.log_doubt)
-
-
-def _odds_against(
-    best: ScoredPose,
-    ranked: Sequence[ScoredPose],
-    ahead_of: Callable[[ScoredPose, ScoredPose], float],
-) -> list[float]:
-    """Return the log odds of each pose against the best."""
-    return [0.0 if pose is best else ahead_of(pose, best) for pose in ranked]
 
 
 def is_turn_known(pose: ScoredPose, rules: AcceptanceRules) -> bool:

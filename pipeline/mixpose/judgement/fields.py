@@ -69,7 +69,7 @@ def fields_at(
 ) -> Fields:
     """Compute the weighted residuals of the features met, and their fields."""
     r, rows = roots * matches.offsets.ravel(), roots[:, None] * matches.J.reshape(-1, 6)
-    fields = fields_of_sensors(matches, shares, shares.sum(axis=1))
+    fields = fields_of_sensors(matches, shares)
     if matches.owners is not None:
         r, rows, fields = (_folded(array, matches) for array in (r, rows, fields))
     J, count = rows[:, chosen], len(chosen)
@@ -84,14 +84,14 @@ def fields_at(
     return Fields(r, J, fields, markers, kinds, information, inverse, projected, shifts, remaining)
 
 
-def fields_of_sensors(matches: Matches, shares: Floats, met: Floats) -> Floats:
-    """Return the fields of sensors (R, q), weighted by shares (L, N), whose sums are `met` (L,).
+def fields_of_sensors(matches: Matches, shares: Floats) -> Floats:
+    """Return the fields of sensors (R, q), weighted by shares (L, N).
 
     Each coordinate has an offset (kind 1), and two that turn, scale and shear features about their
     middle (kind 2).
     """
     L, N = shares.shape
-    total = np.maximum(met, 1e-6)[:, None]
+    total = np.maximum(shares.sum(axis=1), 1e-6)[:, None]
     away = matches.places - ((shares[:, None] @ matches.places)[:, 0] / total)[:, None]
     spread = np.vecdot(shares, np.vecdot(away, away))
     size = np.sqrt(spread / (matches.dimensions * total[:, 0]))

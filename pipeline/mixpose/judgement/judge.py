@@ -145,20 +145,12 @@ def judge(
     free: Mask,
     rules: JudgementRules = JudgementRules(),
     *,
-    before: RememberedNoise = RememberedNoise(),
-    clutter: ClutterRates = ClutterRates(),
     prior: Prior | None = None,
     left_out: Mapping[str, str] | None = None,
-    matches: Matches | None = None,
-    noise: NoiseEstimate | None = None,
 ) -> ScoredPose:
-    """Judge a pose that was estimated in free directions (6,); arguments as in `Case`."""
-    return judge_together(
-        [Case(objective, T_world_object, before, clutter, prior, matches, noise)],
-        free,
-        rules,
-        left_out,
-    )[0]
+    """Judge a pose that was estimated in free directions (6,), without frames before."""
+    case = Case(objective, T_world_object, prior=prior)
+    return judge_together([case], free, rules, left_out)[0]
 
 
 def judge_together(

@@ -318,7 +318,7 @@ def _fields(matches: Matches, shares: Floats, size: Floats) -> Floats:
     """Return the usual fields (R, q), of 1 σ_ε: of sensors, and the size by errors of markers."""
     L = len(shares)
     size = size * math.sqrt(L / max(float(np.vdot(size, size)), 1e-9))
-    return np.hstack([fields_of_sensors(matches, shares, shares.sum(axis=1)), size])
+    return np.hstack([fields_of_sensors(matches, shares), size])
 
 
 def _usual(fields: Floats, lenses: Floats, model: NoiseModel) -> Floats:

@@ -33,14 +33,7 @@ from mixpose.constants import constant
 from mixpose.judgement.cut import with_cut_spots
 from mixpose.judgement.fields import Fields, fields_at
 from mixpose.judgement.information import inverted, unit
-from mixpose.matching import (
-    ErrorRules,
-    Matches,
-    NoiseEstimate,
-    errors_seen,
-    pooled,
-    residual_ratio,
-)
+from mixpose.matching import ErrorRules, Matches, NoiseEstimate, errors_seen, pooled, residual_ratio
 from mixpose.records import Floats, Mask, replace
 
 Biases: TypeAlias = Mapping[tuple[str, ...], Floats]

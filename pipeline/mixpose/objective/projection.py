@@ -20,7 +20,7 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.density import Observation
-from mixpose.records import Floats, Indices, Mask
+from mixpose.records import Floats, Indices, Mask, replace
 from mixpose.sensors import Sensor, facing, hide, side_by_side
 
 _NOTHING = np.array([])
@@ -42,6 +42,10 @@ class View:
     estimated: float = 0.0  # part of the delay that was estimated
     # if its calibration is not exact: the sensor without motion, then with each error
     doubts: tuple[Sensor, ...] = ()
+
+    def only(self, chosen: Mask) -> View:
+        """Return the view with the chosen (M,) of its detections; itself if these are all."""
+        return self if chosen.all() else replace(self, observation=self.observation.only(chosen))
 
 
 class Match(NamedTuple):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -114,7 +114,7 @@ def _unclaimed_view(view: View, others: Sequence[Finding]) -> View:
     for finding in others:
         if finding.name == view.name and finding.expectation is not None:
             unclaimed &= finding.expectation.unexplained
-    return replace(view, observation=view.observation.only(unclaimed))
+    return view.only(unclaimed)
 
 
 def _expect(view: View, body: Body, T: Floats, points: Floats | None, *, sure: bool) -> Expectation:

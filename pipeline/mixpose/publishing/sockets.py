@@ -13,13 +13,7 @@ from mixpose import rigid
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import header_text
 from mixpose.publishing.channel import PublishingRules
-from mixpose.publishing.message import (
-    Address,
-    Message,
-    Sender,
-    TooLargeError,
-    path_words,
-)
+from mixpose.publishing.message import Address, Message, Sender, TooLargeError, path_words
 
 HEADER_S = 1.0
 """Seconds after which the header, with the unit, is repeated for new listeners."""

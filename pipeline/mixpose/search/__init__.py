@@ -5,13 +5,9 @@ from mixpose.search.copies import (
     SeenTogether as SeenTogether,
     search_copies as search_copies,
 )
-from mixpose.search.from_points import (
-    TriangulatedPoints as TriangulatedPoints,
-    triangulate as triangulate,
-)
+from mixpose.search.from_points import triangulate as triangulate
 from mixpose.search.poses import (
     Descent as Descent,
-    Stage as Stage,
     spread_rotations as spread_rotations,
     distinct_poses as distinct_poses,
 )
@@ -34,7 +30,4 @@ from mixpose.search.three_points import (
     align_triples as align_triples,
     depths as depths,
 )
-from mixpose.search.triples import (
-    far_apart as far_apart,
-    thinned as thinned,
-)
+from mixpose.search.triples import far_apart as far_apart, thinned as thinned

@@ -41,7 +41,6 @@ from mixpose.search.problem import (
     SearchProblem,
     SensorDetections,
     is_pointlike,
-    largest_error,
     sensor_detections,
 )
 from mixpose.sensors import Rays
@@ -84,8 +83,8 @@ class SeenTogether:
     @cached_property
     def _cameras(self) -> list[tuple[SensorDetections, Rays, float]]:
         """Sensors with lines of sight, and the largest errors of their detections."""
-        reach = partial(largest_error, rules=self.rules)
-        return [(sensor, sensor.rays, reach(sensor)) for sensor in self.detections if sensor.rays]
+        sensors = [(sensor, sensor.rays) for sensor in self.detections if sensor.rays]
+        return [(sensor, rays, sensor.reach(self.rules)) for sensor, rays in sensors]
 
     @cached_property
     def points(self) -> TriangulatedPoints | None:
@@ -173,10 +172,7 @@ def _candidates(
 
 
 def _near_triples(points: TriangulatedPoints, longest: float, limit: int) -> Indices:
-    """Return triples (K, 3) of points that share no ray and may be within `longest` of each other.
-
-    The most promising come first; there are `limit` at most.
-    """
+    """Return the first `limit` triples (K, 3) of points within `longest` that share no ray."""
     pairs = cKDTree(points.points).query_pairs(2 * longest, output_type="ndarray")
     distances = np.linalg.norm(np.subtract(*points.points[pairs.T]), axis=1)
     pairs = pairs[distances < longest + points.tolerance[pairs].sum(axis=1)]

@@ -114,6 +114,10 @@ class SensorDetections:
         """σ_ε of the sensor."""
         return self.view.observation.sigma
 
+    def reach(self, rules: JudgementRules) -> float:
+        """Return the largest error of the detections, in the sensor's units."""
+        return rules.noise.errors.met * self.sigma
+
     @cached_property
     def moments(self) -> tuple[Floats, float]:
         """Mean (m,) of the sensor's pattern, and its root mean square distance from the mean."""
@@ -140,11 +144,6 @@ def sensor_detections(views: Sequence[View], body: Body | None = None) -> list[S
         equal_weights = replace(view, observation=observation)
         detections.append(SensorDetections(equal_weights, points, view.sensor.rays(points)))
     return detections
-
-
-def largest_error(sensor: SensorDetections, rules: JudgementRules) -> float:
-    """Return the largest error of a sensor's detections, in its units."""
-    return rules.noise.errors.met * sensor.sigma
 
 
 def can_fix(detections: Sequence[SensorDetections], body: Body, free: Mask) -> bool:
@@ -201,8 +200,8 @@ class SearchProblem:
         return [(sensor, sensor.rays) for sensor in sensors if sensor.rays]
 
     def reach(self, sensor: SensorDetections) -> float:
-        """Largest error of a sensor's detections, in its units."""
-        return largest_error(sensor, self.rules)
+        """Return the largest error of a sensor's detections, in its units."""
+        return sensor.reach(self.rules)
 
     def constrained(self, poses: Floats) -> Floats:
         """Return poses (H, 4, 4) with their held directions set to the reference's."""

@@ -27,13 +27,7 @@ from mixpose.search.poses import (
     matches_of,
     spread_poses,
 )
-from mixpose.search.problem import (
-    THOROUGH,
-    SearchBudget,
-    SearchProblem,
-    can_fix,
-    sensor_detections,
-)
+from mixpose.search.problem import THOROUGH, SearchBudget, SearchProblem, can_fix, sensor_detections
 from mixpose.search.three_points import Guesses
 from mixpose.search.triples import thinned
 
@@ -129,8 +123,7 @@ class _Search:
         self._by_evidence = bool(cameras) and all(
             sensor.rays is not None for sensor in problem.detections
         )
-        self._has_several_cameras = self._by_evidence and len(cameras) > 1
-        self._has_one_camera = self._by_evidence and len(cameras) == 1
+        self._camera_count = len(cameras) if self._by_evidence else 0
         self._descent = Descent(
             views, thinned(self._body, 4 * self._budget.sample), problem.free, self._budget
         )
@@ -203,7 +196,7 @@ class _Search:
             order = order[distinct_poses(body, poses[order], budget.alike)][:limit]
             poses, ranks, priors = poses[order], ranks[order], priors[order]
             best = float(ranks.max(initial=0.0))
-            if self._has_one_camera:
+            if self._camera_count == 1:
                 near_best = guesses[rank > best - 1]
                 repeats = self._count_repeats(poses[:1], near_best, previous, repeats)
                 if repeats * _share_of_rivals(best - margin, best) >= budget.repeats:
@@ -240,7 +233,7 @@ class _Search:
 
     def _are_sufficient(self, guesses: Floats, explained: float) -> bool:
         """Refine the best guesses of several cameras, and test whether the search may end."""
-        if not self._has_several_cameras or (
+        if self._camera_count < 2 or (
             explained < self._sufficient and self._judge(guesses)[0].max() < self._budget.hopeless
         ):
             return False
@@ -248,12 +241,9 @@ class _Search:
         return self._is_convincing()
 
     def _is_convincing(self) -> bool:
-        """Test whether the best pose of several cameras is so evident that the search may end.
-
-        Chance would hardly give it this evidence or lead, and it meets the body well enough.
-        """
+        """Test whether the best pose of several cameras is so evident that the search may end."""
         budget, ranks = self._budget, self._scores[0]
-        if not self._has_several_cameras or ranks.max(initial=0.0) <= 0:
+        if self._camera_count < 2 or ranks.max(initial=0.0) <= 0:
             return False
         lead = ranks[0] - ranks[self._distinct(2)[-1]]
         if ranks[0] <= budget.beyond_doubt and lead <= budget.outdone:

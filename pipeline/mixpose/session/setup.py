@@ -94,9 +94,14 @@ class Session:
         return (ObjectSetup(self.body, self.start, self.count), *self.other_objects)
 
     @property
+    def bodies(self) -> dict[str, Body]:
+        """All bodies by label, identical ones numbered, in the order of their pose lines."""
+        return {label: setup.body for setup in self.objects for label in setup.labels}
+
+    @property
     def labels(self) -> tuple[str, ...]:
-        """Names of all bodies, identical ones numbered, in the order of their pose lines."""
-        return tuple(label for setup in self.objects for label in setup.labels)
+        """Labels of all bodies, in the order of their pose lines."""
+        return tuple(self.bodies)
 
     def with_only(self, name: str) -> Session:
         """Return the session with a single one of its bodies, by name."""

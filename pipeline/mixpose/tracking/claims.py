@@ -52,10 +52,7 @@ class Claims:
     def views_with(self, chosen: Mask) -> list[View]:
         """Return the views with only some of their detections (D,)."""
         masks = [chosen[a:b] for a, b in pairwise(self.begins.tolist())]
-        return [
-            view if mask.all() else replace(view, observation=view.observation.only(mask))
-            for view, mask in zip(self.views, masks, strict=True)
-        ]
+        return [view.only(mask) for view, mask in zip(self.views, masks, strict=True)]
 
     def features(self, body: Body, T_world_object: Floats) -> Floats:
         """Return the places (n, 3) of a body's features in all sensors at a pose."""

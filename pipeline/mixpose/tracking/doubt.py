@@ -97,7 +97,7 @@ def _mistaken_after(
             sizes[name] = mistake._replace(log_odds=least)
         return {**track.mistaken, **sizes}
     # a single frame may mislead as rarely as a session is mistaken
-    most, least = _largest_log_odds(data), -_even_odds(data)
+    most, least = 2 * _even_odds(data), -_even_odds(data)
     return {
         mistake.name: mistake._replace(log_odds=max(min(mistake.log_odds, most), -most))
         for mistake in mistakes
@@ -121,10 +121,7 @@ def _contrast(a: ScoredPose, b: ScoredPose) -> str:
 
 
 def _are_alike(a: ScoredPose, b: ScoredPose) -> bool:
-    """Test whether two poses of a frame share at least half of the detections of the first.
-
-    Such poses are two tilts of one body, and none is in a mirror.
-    """
+    """Test whether poses share half of the first's detections: two tilts, and none in a mirror."""
     if a.matches.names != b.matches.names:
         return False
     pairs = zip(a.matches.detections, b.matches.detections, strict=True)
@@ -147,13 +144,18 @@ def _mirror_images(data: Frame, verdict: Verdict) -> list[ScoredPose]:
 def _alternatives(
     data: Frame, best: ScoredPose, mistakes: Sequence[Mistake], evidence: float
 ) -> Iterator[Alternative]:
-    """Yield other explanations of a frame with a sure pose, with their log odds."""
+    """Yield other explanations of a frame with a sure pose, with their log odds.
+
+    `evidence` is against clutter in all frames before the first ok one, see `_lasting_evidence`.
+    """
     rules, noise = data.rules.acceptance, data.rules.judgement.noise
     if data.options.mirrors and is_flat(data):
         known = data.log_odds_other_at(best.T_world_object)  # None unless both were seen
         yield Alternative(IN_A_MIRROR, 0.0 if known is None else known)
     yield Alternative(FEW, log_odds_other(data, best))
-    yield Alternative(UNSURE, _log_odds_of_chance(best, evidence))
+    # clutter that looks like the body in all frames so far, beyond its odds, which count already
+    more = best.log_evidence - evidence
+    yield Alternative(UNSURE, math.log(-math.expm1(-more)) - evidence if more > 0 else -math.inf)
     # in a scene with mirrors a frame may show either side
     of_image = 0.5 if data.options.mirrors else rules.mistaken
     likely = [of_image if mistake.name == MIRRORED else rules.mistaken for mistake in mistakes]
@@ -163,16 +165,6 @@ def _alternatives(
         yield Alternative(CHANGED)
     if is_open(best, data.free, rules, noise):
         yield Alternative(OPEN)
-
-
-def _log_odds_of_chance(best: ScoredPose, evidence: float) -> float:
-    """Return log odds of clutter that looks like the body in all frames before the first ok one.
-
-    `evidence` for the body is that of a frame by itself, or of all that go on from each other.
-    """
-    more = best.log_evidence - evidence
-    # beyond the odds of clutter, which count already
-    return math.log(-math.expm1(-more)) - evidence if more > 0 else -math.inf
 
 
 def _lasting_evidence(data: Frame, best: ScoredPose) -> tuple[float, Shape | None]:
@@ -194,11 +186,6 @@ def _lasting_evidence(data: Frame, best: ScoredPose) -> tuple[float, Shape | Non
     return shape.log_odds(data.body.radius, model), shape
 
 
-def _gained(data: Frame, best: ScoredPose) -> float:
-    """Return how much likelier the frames before make a pose, in nats."""
-    return max(data.prior(best.T_world_object)[0] - data.flat_prior[0], 0.0)
-
-
 def log_odds_other(data: Frame, judged: ScoredPose) -> float:
     """Return log odds of another thing that has exactly the met features alike.
 
@@ -213,12 +200,9 @@ def log_odds_other(data: Frame, judged: ScoredPose) -> float:
     covered = np.minimum(in_view, 2)[matches.met_by == 0].sum()
     odds = 3 * (met - 2) * math.log(rules.look_alikes.alike)
     odds -= covered * rules.judgement.detection.log_missed
-    return float(odds - (_gained(data, judged) if data.track.is_identified else 0.0))
-
-
-def _largest_log_odds(data: Frame) -> float:
-    """Return the largest log odds that frames can give a mistake."""
-    return 2 * _even_odds(data)
+    if data.track.is_identified:
+        odds -= max(data.prior(judged.T_world_object)[0] - data.flat_prior[0], 0.0)
+    return float(odds)
 
 
 def _contradiction_mistake(data: Frame, judged: ScoredPose) -> Mistake:
@@ -257,7 +241,7 @@ def reflection_mistake(data: Frame, judged: ScoredPose) -> Mistake:
     """
     track, lasts = data.track, not data.options.mirrors
     before = track.log_odds_mistaken(MIRRORED) if lasts else 0.0
-    is_early = track.ok_count < data.rules.proposals.believed and before > -_largest_log_odds(data)
+    is_early = track.ok_count < data.rules.proposals.believed and before > -2 * _even_odds(data)
     # one sensor sees hardly more of a reversed depth than larger residuals
     is_far = len(judged.used.images) == 1 and judged.residual_ratio > 1
     is_asked = before > 0 or is_early or is_far
@@ -331,7 +315,9 @@ def _log_odds_near(alone: _Alone, is_asked: bool, likely: float) -> float:
     can_tilt = len(features) > 2 and not data.is_timed
     if is_asked and can_tilt and alone.evidence > -math.inf:
         # with its depth reversed; the track followed the body, and not this one
-        T_reversed = other_tilt(data.body, features, T, _across(judged))
+        by_shift = judged.used.J[..., :3].reshape(-1, 3)
+        across = np.linalg.eigh(by_shift.T @ by_shift)[1][:, 0]  # in which shifts are seen least
+        T_reversed = other_tilt(data.body, features, T, across)
         start = Start(T_reversed, alone.frame.close_uncertainty)
         odds = max(odds, _evidence(_reflected_frame(alone.frame, features), start) - alone.evidence)
     return odds
@@ -345,12 +331,6 @@ def _log_odds_anywhere(alone: _Alone) -> Iterator[float]:
     rivals = [rival for rival in candidates_of(mirror) if rival.evidence > least]
     for start in starts_at(mirror, rivals):
         yield _evidence(mirror, start) - alone.evidence
-
-
-def _across(judged: ScoredPose) -> Floats:
-    """Return the direction (3,) in the world in which sensors see least of a shift."""
-    by_shift = judged.used.J[..., :3].reshape(-1, 3)
-    return np.asarray(np.linalg.eigh(by_shift.T @ by_shift)[1][:, 0])
 
 
 def _is_by_chance(data: Frame, judged: ScoredPose) -> bool:

@@ -46,10 +46,7 @@ def follow(
 def _continued(
     frame: Frame, pose: Branch, alike: Sequence[Floats] | None
 ) -> tuple[Branch, Floats | None]:
-    """Return the branch of a pose for the next frame, and the twist (6,) that led to the pose.
-
-    The twist is None where the pose does not go on from the frame before.
-    """
+    """Return the branch of a pose for the next frame, and the twist (6,) to it, if it goes on."""
     track, body, rules = frame.track, frame.body, frame.rules.motion
     elapsed, is_timed = track.elapsed(frame.frame, frame.time_s), track.is_timed_as(frame.time_s)
     steady, T, moved = per_kind(body.radius, rules.steady), pose.T_world_object, None

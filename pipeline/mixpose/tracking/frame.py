@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, reduce
 from typing import Any
@@ -12,15 +12,7 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, Fit, free_mask
-from mixpose.judgement import (
-    AcceptanceRules,
-    Prior,
-    ScoredPose,
-    convinces,
-    flat_prior,
-    is_sure,
-    nearest_alike,
-)
+from mixpose.judgement import Prior, ScoredPose, convinces, flat_prior, is_sure, nearest_alike
 from mixpose.matching import Matches, NoiseEstimate, log_likelihood, pooled
 from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
 from mixpose.records import Floats, Mask, replace
@@ -83,26 +75,18 @@ class Frame(Setup):
     companion_prediction: Branch | None = None  # by the pose of another body
     sensors: Sequence[str] = ()  # all with a frame, also those that saw nothing
 
-    def is_best_accepted(
-        self,
-        accepts: Callable[[ScoredPose, Mask, AcceptanceRules], bool],
-        ranked: Sequence[ScoredPose],
-    ) -> bool:
-        """Test whether there is a pose and the most evident one passes a test of acceptance."""
-        return bool(ranked) and accepts(ranked[0], self.free, self.rules.acceptance)
-
     @property
     def has_triangulated_start(self) -> bool:
         """Test whether a start comes from triangulated points instead of a prediction."""
         return any(start.prediction is None for start in self.starts)
 
-    @property
-    def criterion(self) -> Callable[[ScoredPose, Mask, AcceptanceRules], bool]:
-        """Return the test of a pose after which the body is sought nowhere else.
+    def is_found_by(self, ranked: Sequence[ScoredPose]) -> bool:
+        """Test whether the most evident pose is such that the body is sought nowhere else.
 
         Among all triangulated points that are its features, a sure pose suffices.
         """
-        return is_sure if self.has_triangulated_start else convinces
+        accepts = is_sure if self.has_triangulated_start else convinces
+        return bool(ranked) and accepts(ranked[0], self.free, self.rules.acceptance)
 
     @cached_property
     def is_timed(self) -> bool:
@@ -218,10 +202,6 @@ class Frame(Setup):
     def log_densities(self, poses: Floats) -> Floats:
         """Return log densities (K,) of poses (K, 4, 4) by the predictions, or elsewhere."""
         return np.asarray(log_densities_by([self], poses)[0])
-
-    def gains(self, poses: Floats) -> Floats:
-        """Return how much likelier (K,) the track makes poses (K, 4, 4) than a flat prior."""
-        return np.asarray(gains_by([self], poses)[0])
 
     def feature_distances(self, T_world_object: Floats) -> list[Floats]:
         """Return how far the features (N,) of each prediction are from those at a pose.

@@ -15,14 +15,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from mixpose.body import (
-    Body,
-    like_features,
-    mirror_image,
-    reflection,
-    thickness,
-    tolerance_of,
-)
+from mixpose.body import Body, like_features, mirror_image, reflection, thickness, tolerance_of
 from mixpose.body.symmetry import motions
 from mixpose.judgement import ScoredPose
 from mixpose.records import Floats
@@ -67,10 +60,7 @@ def mirror_odds(data: Frame, first: ScoredPose, second: ScoredPose) -> tuple[flo
 
 @lru_cache(maxsize=64)
 def _improper_symmetries(body: Body, alike: float) -> tuple[Floats, ...]:
-    """Return improper motions (4, 4) that map the body onto itself; none for most bodies.
-
-    Features of its mirror image may be off its own by a share `alike` of its radius.
-    """
+    """Return improper motions (4, 4) that map the body onto itself, up to `alike` of its radius."""
     everything = frozenset(range(len(body)))
     image, M = mirror_image(body, everything), reflection(body.means)
     # each feature of a flat body maps onto itself; a normal would point to the other side

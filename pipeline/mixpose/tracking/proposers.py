@@ -30,7 +30,7 @@ from mixpose.search import (
     search_frame,
     thinned,
 )
-from mixpose.tracking.frame import Frame, Start
+from mixpose.tracking.frame import Frame, Start, gains_by
 from mixpose.tracking.ranges import are_associated
 from mixpose.tracking.track import likely_branches
 
@@ -70,7 +70,7 @@ def is_doubtful(frame: Frame, ranked: Sequence[ScoredPose]) -> bool:
         return odds > rules.acceptance.log_doubt
     is_new = track.ok_count < rules.proposals.believed
     is_far = bool(ranked) and _is_far(frame, ranked[0], is_new=is_new)
-    if frame.is_best_accepted(frame.criterion, ranked) and not is_far:
+    if frame.is_found_by(ranked) and not is_far:
         return False
     if not ranked or not is_sure(ranked[0], frame.free, rules.acceptance):
         return True
@@ -92,7 +92,7 @@ def _leaves_any(frame: Frame, pose: ScoredPose) -> bool:
 
 def is_convincing(frame: Frame, ranked: Sequence[ScoredPose]) -> bool:
     """Test whether the best pose convinces, or lies where expected and is not doubtful."""
-    return frame.is_best_accepted(frame.criterion, ranked) or not is_doubtful(frame, ranked)
+    return frame.is_found_by(ranked) or not is_doubtful(frame, ranked)
 
 
 def _is_far(frame: Frame, pose: ScoredPose, *, is_new: bool) -> bool:
@@ -106,17 +106,12 @@ def _is_far(frame: Frame, pose: ScoredPose, *, is_new: bool) -> bool:
     if pose.gained < rules.proposals.fallen * frame.track.gained:
         return True
     # much is met far off; or at an unexpected pose anything
-    share = _close(frame, pose)
+    shares = pose.used.shares
+    share = float(shares[_met_closely(frame, pose)].sum()) / max(float(shares.sum()), 1e-12)
     is_all = share * pose.coverage >= 1
     return share < rules.acceptance.convincing or not (
         is_all or frame.is_expected(pose.T_world_object)
     )
-
-
-def _close(frame: Frame, pose: ScoredPose) -> float:
-    """Return the share of met features that are as close as the noise of earlier frames allows."""
-    shares = pose.used.shares
-    return float(shares[_met_closely(frame, pose)].sum()) / max(float(shares.sum()), 1e-12)
 
 
 def _met_closely(frame: Frame, pose: ScoredPose) -> Mask:
@@ -146,23 +141,15 @@ def within(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     if first is None or first.spread is None or not _are_ranges(frame):
         return []
     uncertainty = np.where(frame.free, first.uncertainty, 0.0)
-    if not _is_wide(frame, first.T_world_object, uncertainty):
+    T, wide = first.T_world_object, uncertainty[None]
+    blurs = widest_blurs(frame.views, frame.body, T[None], wide, frame.rules.fit)
+    if not (blurs > frame.sigmas).any():  # features may be off by no more than σ_ε
         return []
-    return _around(frame, first.T_world_object, uncertainty, frame.rules.ranges.modes)
-
-
-def _is_wide(frame: Frame, T_world_object: Floats, uncertainty: Floats) -> bool:
-    """Test whether features may be off by more than σ_ε at a pose with standard deviations (6,)."""
-    arguments = T_world_object[None], uncertainty[None], frame.rules.fit
-    blurs = widest_blurs(frame.views, frame.body, *arguments)
-    return bool((blurs > frame.sigmas).any())
+    return _around(frame, T, uncertainty, frame.rules.ranges.modes)
 
 
 def _around(frame: Frame, T_world_object: Floats, wide: Floats, kept: int) -> list[Start]:
-    """Return starts to which poses drawn around one with standard deviations (6,) descend.
-
-    At most `kept` that meet anything, the best first.
-    """
+    """Return starts, `kept` at most, to which poses drawn around one descend, the best first."""
     rules, sigmas = frame.rules.proposals, np.array(frame.sigmas)
     narrow = wide / rules.narrowing
     stages = [
@@ -209,7 +196,7 @@ def candidates_of(frame: Frame) -> list[Candidate]:
         T_reference=frame.T_reference,
         rules=frame.rules.judgement,
         seed=frame.options.seed,
-        log_prior=frame.gains,
+        log_prior=lambda poses: np.asarray(gains_by([frame], poses)[0]),
     )
     among_moving, spent = list[Candidate](), SearchReport()
     moving = frame.track.clutter.without(frame.views, frame.rules.proposals.static)

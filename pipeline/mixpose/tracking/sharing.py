@@ -106,10 +106,7 @@ class Sharing:
         return starts
 
     def _triangulated_starts(self) -> dict[int, Starts]:
-        """Return starts at triangulated points for bodies without claims, and their rivals.
-
-        Identical bodies get as many poses as there are, by the likeliest assignment.
-        """
+        """Return starts at triangulated points for bodies without claims, and their rivals."""
         waiting = [k for k in range(len(self.bodies)) if k not in self.claimed]
         kinds = list({id(self.bodies[k].body): self.bodies[k] for k in waiting}.values())
         if self._shared is None or any(view.sensor.dimension != 2 for view in self.views):

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from mixpose.density import Observation
 from mixpose.objective import View
-from mixpose.records import Floats, Indices, Mask, replace
+from mixpose.records import Floats, Indices, Mask
 from mixpose.sensors import clouds_among
 
 
@@ -48,10 +48,7 @@ class StaticClutter:
             common = np.any([moving[k] for k in planes], axis=0)
             for k in planes:
                 moving[k] = common
-        return [
-            view if mask.all() else replace(view, observation=view.observation.only(mask))
-            for view, mask in zip(views, moving, strict=True)
-        ]
+        return [view.only(mask) for view, mask in zip(views, moving, strict=True)]
 
     def _moving(self, view: View, frames: int) -> Mask:
         """Return which detections (M,) of a view are not static."""

@@ -96,10 +96,7 @@ def _log_students(twists: Floats, uncertainty: Floats, free: Mask, rules: Motion
 
 @lru_cache(maxsize=16)
 def _student(free: tuple[bool, ...], n: float) -> tuple[Floats, float]:
-    """Return exponents (2,) of Student's densities of n degrees of freedom, and their log peak.
-
-    One is of shifts and one of turns, in as many directions as are `free`.
-    """
+    """Return exponents (2,) of Student's densities of shifts and of turns, and their log peak."""
     p = np.array([sum(free[:3]), sum(free[3:])])
     peak = float((gammaln((n + p) / 2) - gammaln(n / 2)).sum())
     return 0.5 * (n + p), peak - 0.5 * sum(free) * math.log(n * math.pi)

@@ -386,10 +386,7 @@ def _elsewhere_after(data: Frame, best: ScoredPose) -> float:
 def _branches(
     data: Frame, verdict: Verdict, best: ScoredPose
 ) -> list[tuple[Branch, list[Floats] | None]]:
-    """Return the poses to be followed, the best first, and motions to their look-alikes.
-
-    Of single ranges, where frames are fused, unlikely poses too.
-    """
+    """Return the poses to be followed, the best first, and motions to their look-alikes."""
     branches, fuse = list[tuple[Branch, list[Floats] | None]](), data.options.fuse
     unlikely = sorted(verdict.faint if fuse else (), key=lambda pair: -pair[1])
     for pose, weight in (*verdict.kept, *unlikely[: data.rules.ranges.modes]):

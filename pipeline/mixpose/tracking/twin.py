@@ -127,7 +127,7 @@ def leftover_of(pose: ScoredPose, data: Frame) -> SeenTogether:
         if len(is_left) and view.name in numbers and view.name not in pose.left_out:
             is_left[numbers[view.name][numbers[view.name] >= 0]] = False
         if is_left.any():
-            views.append(replace(view, observation=view.observation.only(is_left)))
+            views.append(view.only(is_left))
     return SeenTogether(views, data.rules.judgement, data.rules.search)
 
 
@@ -192,16 +192,12 @@ def _is_due(data: Frame, best: ScoredPose, views: Sequence[View]) -> bool:
     # enough to fix a pose, and to cast doubt, in as many sensors; a mirror image is recognised by
     # its place, however much of the body is hidden
     most, is_much = float(np.minimum(counts, used.met).sum()), is_flat(data) and len(cells) > 1
-    is_much = is_much or most >= used.met.sum() - _most_missed(data)
+    may_miss = -data.rules.acceptance.log_doubt / _log_odds_of_match(data)
+    is_much = is_much or most >= used.met.sum() - may_miss
     if 2 * most < np.count_nonzero(data.free) or not is_much:
         return False
     # a flat body has a mirror image that looks like it
     return is_flat(data) or _is_in_turn(data, views)
-
-
-def _most_missed(data: Frame) -> float:
-    """Return how many more features a second pose may miss and still cast doubt on the best."""
-    return -data.rules.acceptance.log_doubt / _log_odds_of_match(data)
 
 
 def _log_odds_of_match(data: Frame) -> float:
@@ -210,19 +206,15 @@ def _log_odds_of_match(data: Frame) -> float:
 
 
 def _second_pose(data: Frame, best: ScoredPose, leftover: SeenTogether) -> ScoredPose | None:
-    """Return a pose, sure by itself, that may be the body as well as the best one; else None.
-
-    As many sensors agree about it as about the best one, two at most.
-    """
+    """Return a sure pose that as many sensors meet as the best one, two at most; else None."""
     agree = min(int(np.count_nonzero(best.used.met)), 2)
+    least = data.rules.acceptance.log_doubt
     alone = data.alone(views=leftover.views, static_views=(), starts=())
-    for pose in _candidate_poses(alone, leftover):
-        least = data.rules.acceptance.log_doubt
+    for pose in _sure_poses(alone, leftover):
         is_likely = _by_misses(best, pose, data) > least
         is_likely = is_likely or mirror_odds(data, best, pose)[0] > -least
-        is_seen = bool(np.count_nonzero(pose.matches.met) >= agree)
-        if is_likely and is_seen and is_sure(pose, data.free, data.rules.acceptance):
-            return replace(pose, proposer=SECOND_POSE)
+        if is_likely and np.count_nonzero(pose.matches.met) >= agree:
+            return pose
     return None
 
 
@@ -230,14 +222,13 @@ def _may_be_elsewhere(data: Frame, best: ScoredPose, leftover: SeenTogether) -> 
     """Return sensors that miss a pose met by one alone, and may see the body elsewhere."""
     if (best.matches.dimensions != 2).any():
         return []
-    names = unconfirming_sensors(best, data.rules.acceptance)
-    views = [view for view in leftover.views if view.name in names and _may_fix(view, data)]
+    names, needed = unconfirming_sensors(best, data.rules.acceptance), np.count_nonzero(data.free)
+    views = [
+        view
+        for view in leftover.views
+        if view.name in names and view.observation.cells * view.sensor.dimension > needed
+    ]
     return views if _is_in_turn(data, views) else []
-
-
-def _may_fix(view: View, data: Frame) -> bool:
-    """Test whether a sensor has more coordinates than a pose needs."""
-    return bool(view.observation.cells * view.sensor.dimension > np.count_nonzero(data.free))
 
 
 def _is_in_turn(data: Frame, views: Sequence[View]) -> bool:
@@ -255,38 +246,28 @@ def _most_tried(data: Frame, views: Sequence[View]) -> dict[str, int]:
 
 
 def _sure_pose_by(data: Frame, views: Sequence[View]) -> ScoredPose | None:
-    """Return a pose that is sure by some views alone; else None.
-
-    These see nothing of the best pose, so that either sensor may be out of step.
-    """
-    alone = data.alone(views=views, static_views=(), starts=()).changed(options=data.options)
+    """Return a pose that is sure by views alone that see nothing of the best pose; else None."""
     together = SeenTogether(views, data.rules.judgement, data.rules.search)
-    for pose in _candidate_poses(alone, together):
-        if is_sure(pose, data.free, data.rules.acceptance):
-            return replace(pose, proposer=SECOND_POSE)
-    return None
+    alone = data.alone(views=views, static_views=(), starts=()).changed(options=data.options)
+    return next(_sure_poses(alone, together), None)
 
 
 def _previous_second(data: Frame, best: ScoredPose, leftover: SeenTogether) -> ScoredPose | None:
     """Judge the second pose of the frame before in this frame."""
     if data.track.log_odds_twice == -math.inf or not leftover.views:
         return None
-    if (start := next(_other_starts(data, best), None)) is None:
+    predecessor = data.predecessor(best.T_world_object)
+    # another prediction, even right beside that of the best pose
+    others = [branch for branch in data.predictions if branch is not predecessor]
+    if not others:
         return None
+    start = Start(others[0].T_world_object, others[0].uncertainty)
     likelihood = likelihood_of(data.changed(views=leftover.views, static_views=(), starts=()))
     return likelihood.judge(likelihood.fit(start), start)
 
 
-def _other_starts(data: Frame, best: ScoredPose) -> Iterator[Start]:
-    """Yield the predictions other than that of the best pose, even right beside it."""
-    predecessor = data.predecessor(best.T_world_object)
-    for branch in data.predictions:
-        if branch is not predecessor:
-            yield Start(branch.T_world_object, branch.uncertainty)
-
-
-def _candidate_poses(alone: Frame, leftover: SeenTogether) -> Iterator[ScoredPose]:
-    """Yield candidates of a search, fitted and judged, that may be a second pose."""
+def _sure_poses(alone: Frame, leftover: SeenTogether) -> Iterator[ScoredPose]:
+    """Yield candidates of a search, fitted and judged, that are sure by themselves."""
     likelihood = likelihood_of(alone)
     candidates: Sequence[Copy | Candidate]
     if len(leftover.views) > 1:  # quickly, by triangulated points
@@ -295,4 +276,6 @@ def _candidate_poses(alone: Frame, leftover: SeenTogether) -> Iterator[ScoredPos
         candidates = candidates_of(alone)
     for candidate in candidates[: alone.rules.proposals.seconds]:
         start = Start(candidate.T_world_object, alone.close_uncertainty)
-        yield likelihood.judge(likelihood.fit(start), start)
+        pose = likelihood.judge(likelihood.fit(start), start)
+        if is_sure(pose, alone.free, alone.rules.acceptance):
+            yield replace(pose, proposer=SECOND_POSE)
