@@ -8,7 +8,6 @@ integers) for cameras, lengths for ranges.  A camera has m = 2 coordinates, a ra
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -32,18 +31,19 @@ else:
     def replace(record: Any, /, **changes: Any) -> Any:
         """Return a record with other fields, in a third of the time of the standard library's.
 
-        Only records that check or complete their fields are made as if they were new.
+        Records that check or complete their fields do so again.
         """
         kind, known = type(record), record.__dict__
-        if hasattr(kind, "__post_init__"):
-            return dataclasses.replace(record, **changes)
         names = kind.__match_args__
-        fields = dict(zip(names, map(known.__getitem__, names), strict=True))
-        fields.update(changes)
+        # without what was computed from others
+        old = known if len(known) == len(names) else {name: known[name] for name in names}
+        fields = {**old, **changes}
         if len(fields) > len(names):
             raise TypeError(f"{kind.__name__}: found {[*changes]}; allowed: {[*names]}")
         changed = object.__new__(kind)
-        object.__setattr__(changed, "__dict__", fields)  # without what was computed from others
+        object.__setattr__(changed, "__dict__", fields)
+        if hasattr(kind, "__post_init__"):
+            changed.__post_init__()
         return changed
 
 

@@ -124,9 +124,9 @@ def _rotation_vectors(R: Floats) -> Floats:
     return np.asarray(vectors)
 
 
-def cross(a: Floats, b: Floats) -> Floats:
-    """Return a × b of vectors with components first (3, ...); faster than NumPy's for few."""
-    return (a * b.take(_NEXT, axis=0) - a.take(_NEXT, axis=0) * b).take(_NEXT, axis=0)
+def cross(a: Floats, b: Floats, axis: int = 0) -> Floats:
+    """Return a × b of vectors with components along an axis; faster than NumPy's for few."""
+    return (a * b.take(_NEXT, axis) - a.take(_NEXT, axis) * b).take(_NEXT, axis)
 
 
 def covariance_at(covariance: Floats, arm: Floats) -> Floats:

@@ -8,8 +8,8 @@ _PROJECTION = (
     Mutant(
         "objective-turn-about-x-of-the-other-sign",
         "objective/projection.py",
-        "J[..., 3] = y * c - z * b",
-        "J[..., 3] = z * b - y * c",
+        "cross(arms[..., None, :], by_world, axis=-1)",
+        "cross(arms[..., None, :], by_world, axis=-1) * [-1, 1, 1]",
         "steps about x turn the wrong way",
     ),
     Mutant(

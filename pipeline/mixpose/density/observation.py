@@ -151,8 +151,12 @@ class Observation:
         """Keep detections within a reach, in σ_ε, of places (n, m); all if there are none."""
         if self.points is None or not len(y):
             return self
-        distances, _ = cKDTree(y).query(self.points, distance_upper_bound=reach * self.sigma)
-        near = np.isfinite(distances)
+        limit = reach * self.sigma
+        if len(self.points) * len(y) <= DRAWING.few_pairs:
+            away = self.points[:, None] - y
+            near = (np.vecdot(away, away) < limit * limit).any(axis=1)
+        else:
+            near = np.isfinite(cKDTree(y).query(self.points, distance_upper_bound=limit)[0])
         return self.only(near) if near.any() else self
 
     def density(

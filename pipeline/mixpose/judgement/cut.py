@@ -41,7 +41,7 @@ def with_cut_spots(
 ) -> tuple[Floats, float]:
     """Return what to add to a covariance (k, k) for cut detections, and a factor for the sum."""
     # points in space are no spots, and those of other things seldom agree in three coordinates
-    in_image = (matches.dimensions == 2) & (matches.images[matches.owner] == 1)
+    in_image = (matches.dimensions == 2) & (matches.coordinate_weight == 1)
     is_spot = (matches.detections >= 0) & in_image[:, None]
     met, k = (is_spot & (matches.shares > 0)).nonzero(), len(known)
     if not (len(met[0]) and k and any(errors.chances)):
@@ -81,7 +81,7 @@ def with_cut_spots(
     spread = rows.T @ (weights.reshape(-1, 1) * rows)
     by_case = (along @ G).reshape(-1, k)
     spread += by_case.T @ (chances.reshape(-1, 1) * by_case)
-    spread += np.outer(shift, shift)
+    spread += shift[:, None] * shift
     return spread, _larger(C, spread, G, along, wider, chances, outside, degrees)
 
 
@@ -101,7 +101,7 @@ def _larger(
     by_B, by_both = GB.reshape(G.shape), (GB @ C).reshape(G.shape)
     H, K = by_B @ G.swapaxes(1, 2), by_both @ by_B.swapaxes(1, 2)
     diagonal_H, diagonal_K = (A.diagonal(axis1=1, axis2=2)[:, None] for A in (H, K))
-    pulled, mean, variance = along @ H, np.trace(BC), np.vdot(BC, BC.T)
+    pulled, mean, variance = along @ H, BC.trace(), np.vdot(BC, BC.T)
     more = np.vecdot(wider, diagonal_H) + np.vecdot(pulled, along)
     varied = 2 * np.vecdot(wider, diagonal_K) + np.vecdot(wider @ H**2, wider)
     varied += 2 * np.vecdot(along @ K, along) + 2 * np.vecdot(pulled**2, wider)

@@ -159,7 +159,7 @@ def noise_of(
         in_frame[0, 0], in_frame[0, 4] = redundant, unbiased @ unbiased
         in_frame[1:, 4] = fields.pulls(unbiased, matches) ** 2 @ fields.kinds[:, 1:]
     moments = model.memory * before.moments + in_frame
-    usual = model.usual**2 / float(scale.mean())
+    usual = model.usual**2 / (float(scale.sum()) / len(scale))
     met_by_sensor = sum(matches.met.tolist()) / len(matches.names)
     by_kind, of_fields = _variances(moments, in_frame, met_by_sensor, usual, model)
     share = float(by_kind[1:3].sum() / by_kind[:3].sum())

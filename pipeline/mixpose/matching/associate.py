@@ -72,7 +72,8 @@ def associate(
     neighbours = _to_nearest(
         y, weights, detections, rules.reach_squared * reach, is_open, rules.merged, met, clouds
     )
-    grids = np.flatnonzero(objective.are_grids & is_open.any(axis=1)).tolist()
+    are_grids = objective.are_grids.tolist()
+    grids = [k for k, is_grid in enumerate(are_grids) if is_grid and is_open[k].any()]
     J = J.copy() if grids else J  # the projection is cached
     for k in grids:
         in_view, m, amplitude = seen[k], dimensions[k], float(product[k] / match.norm[k, 0])
@@ -155,6 +156,8 @@ def _to_missed(y: Floats, missed: Mask, radii: Floats) -> Floats:
     whole, so that it lies at their middle.
     """
     farthest = np.zeros(radii.shape)
+    if not (np.count_nonzero(missed) and np.count_nonzero(radii)):  # as a rule
+        return farthest
     for k in np.flatnonzero(missed.any(axis=1) & radii.any(axis=1)).tolist():
         sized = np.flatnonzero(radii[k])
         away = y[k, sized, None] - y[k, missed[k]]
@@ -209,7 +212,7 @@ def _neighbours(
         squared = np.vecdot(away, away)
         for planes in clouds:  # each coordinate is in two of them
             squared[planes] = squared[planes].sum(axis=0) / 2
-        return np.broadcast_to(np.arange(most), squared.shape), squared
+        return np.arange(most) + np.zeros(squared.shape, dtype=np.intp), squared
     trees = [cKDTree(places[places[:, 0] == places[:, 0]]) for places in detections]
     count, limit = 2, math.sqrt(float(reach.max(initial=0.0)))
     while True:

@@ -133,6 +133,8 @@ class Matches:
     @cached_property
     def coordinate_weight(self) -> Floats:
         """Weight of a coordinate (L,): 1/2 in the images of a cloud, as two of them show it."""
+        if self.owners is None:
+            return np.ones(len(self.names))
         return np.where(self.images > 1, 0.5, 1.0)[self.owner]
 
     def summed(self, values: Floats) -> Floats:
@@ -208,7 +210,8 @@ class ErrorRules:
 
     def counted(self, variances: Floats, fields: float = 0.0) -> Floats:
         """Return variances (L,) that weigh sensors, with a common part of `common` or `fields`."""
-        return np.asarray(variances + max(fields, self.common) * (variances.mean() - variances))
+        mean = variances.sum() / len(variances)
+        return np.asarray(variances + max(fields, self.common) * (mean - variances))
 
     def are_off(self, matches: Matches, variances: Floats) -> Mask:
         """Return a mask (L, N) of features met too far off for errors of variances (L, N)."""

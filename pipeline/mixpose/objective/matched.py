@@ -107,7 +107,7 @@ def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Qua
     curvature = _gram(match.J, drawn[..., None, None] * match.J).sum(axis=0)
     if not len(match.pairs):
         return Quadratic(value, gradient, curvature)
-    near = np.flatnonzero(match.bells.any(axis=(0, 2)))
+    (near,) = np.logical_or.reduce(match.bells, axis=(0, 2)).nonzero()
     overlapping = match if len(near) == H else match.of(near)
     J_i, J_j = (overlapping.J.take(column, axis=2) for column in overlapping.pairs.T)
     scaled = (overlapping.bells / variances[..., None])[..., None]

@@ -21,6 +21,7 @@ import numpy as np
 from mixpose.body import Body
 from mixpose.density import Observation
 from mixpose.records import Floats, Indices, Mask, replace
+from mixpose.rigid import cross
 from mixpose.sensors import Sensor, facing, hide, side_by_side
 
 _NOTHING = np.array([])
@@ -181,12 +182,8 @@ def pose_jacobian(by_world: Floats, arms: Floats) -> Floats:
     a · (ω × x) = ω · (x × a).
     """
     J = np.empty((*by_world.shape[:-1], 6))
-    x, y, z = arms[..., 0, None], arms[..., 1, None], arms[..., 2, None]
-    a, b, c = by_world[..., 0], by_world[..., 1], by_world[..., 2]
     J[..., :3] = by_world
-    J[..., 3] = y * c - z * b
-    J[..., 4] = z * a - x * c
-    J[..., 5] = x * b - y * a
+    J[..., 3:] = cross(arms[..., None, :], by_world, axis=-1)
     return J
 
 

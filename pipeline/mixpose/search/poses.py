@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -267,8 +268,15 @@ def distinct_poses(body: Body, poses: Floats, cell: float, *, whole: bool = Fals
     cells = np.round(places / (cell * body.radius))
     # places farther off, or NaN, become one place
     cells = np.clip(np.nan_to_num(cells), -(2.0**62), 2.0**62).astype(np.int64)
-    keys = cells @ np.random.default_rng(0).integers(1, 2**40, cells.shape[1])
-    return np.sort(np.unique(keys, return_index=True)[1])
+    return np.sort(np.unique(cells @ _factors(corners.size), return_index=True)[1])
+
+
+@lru_cache(maxsize=16)
+def _factors(count: int) -> Indices:
+    """Return numbers by which different cells have different sums: always the same at random."""
+    factors = np.random.default_rng(0).integers(1, 2**40, count)
+    factors.flags.writeable = False
+    return factors
 
 
 def spread_poses(problem: SearchProblem) -> tuple[Floats, list[Stage]]:

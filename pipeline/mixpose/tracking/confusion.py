@@ -53,8 +53,12 @@ def confusions_of(
     sure = [k for k, verdict in verdicts.items() if verdict.status == "ok"]
 
     @cache
+    def met(k: int) -> frozenset[int]:
+        return met_features(frames[k], bests[k])
+
+    @cache
     def instead(k: int, j: int) -> list[Confusion]:
-        against = confusions_with(frames[k], bests[k], frames[j])
+        against = confusions_with(frames[k], bests[k], met(k), frames[j])
         return sorted(against, key=lambda confusion: confusion.log_odds)
 
     confusions = {k: [*instead(k, k)] for k in bests}
@@ -109,9 +113,10 @@ def _exchanges(
             yield [(k, j), (j, i)]
 
 
-def confusions_with(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Confusion]:
+def confusions_with(
+    data: Frame, best: ScoredPose, met: frozenset[int], other: Frame
+) -> Iterator[Confusion]:
     """Yield parts of another body, or other parts of its own, that a pose may have met instead."""
-    met = met_features(data, best)
     parts = list(_alike_parts(data, best, met, other))
     if not parts:
         return

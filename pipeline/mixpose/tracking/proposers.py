@@ -117,8 +117,10 @@ def _is_far(frame: Frame, pose: ScoredPose, *, is_new: bool) -> bool:
 def _met_closely(frame: Frame, pose: ScoredPose) -> Mask:
     """Return which features (L, N) are met closely, by the noise before and in this frame."""
     errors, used = frame.rules.judgement.noise.errors, pose.used
-    before = dict(zip((view.name for view in frame.views), frame.variances, strict=True))
-    variances = np.minimum([before.get(name, np.inf) for name in used.names], pose.variances)
+    names = tuple([view.name for view in frame.views])
+    before = dict(zip(names, frame.variances.tolist(), strict=True))
+    known = [before.get(name, math.inf) for name in used.names]
+    variances = np.minimum(known, pose.variances)
     return np.asarray((used.shares > 0) & ~errors.are_off(used, variances[:, None] + used.extra))
 
 
