@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from detections import EIGHT, TRUTH, view_of
+from detections import EIGHT, TRUTH, detect, view_of
 from matches import Seen, scored
 
+from mixpose.body import Body
 from mixpose.fit import EstimatorOptions
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
@@ -100,3 +101,23 @@ def test_of_one_camera_or_two_one_that_meets_a_marker_is_enough(
     alike = 3 * (5 - 2) * np.log(1 / 20)
     assert odds(pinhole_cameras, 5) == pytest.approx(alike + 3 * np.log(4))
     assert odds(pinhole_cameras, 5, 0) == pytest.approx(alike + 2 * 3 * np.log(4))
+
+
+@pytest.mark.parametrize(("missed", "expected"), [(12, "ambiguous"), (0, "ok")])
+def test_what_is_followed_by_three_markers_after_it_was_lost_may_be_another_thing(
+    pinhole_cameras: list[PinholeCamera], missed: int, expected: str
+) -> None:
+    tracker = Tracker.create(EIGHT, EstimatorOptions())
+    track, part = tracker.begin(), Body("part", EIGHT.features[:3])
+    for frame in range(4):
+        views = detect(pinhole_cameras, EIGHT, TRUTH, noise=0.1, seed=frame)
+        track, estimate = tracker.advance(track, frame, None, views)
+    assert estimate.status == "ok"
+    for frame in range(4, 4 + missed):
+        track, estimate = tracker.advance(track, frame, None, [])
+    statuses = list[str]()
+    for frame in range(4 + missed, 12 + missed):
+        views = detect(pinhole_cameras, part, TRUTH, noise=0.1, seed=frame)
+        track, estimate = tracker.advance(track, frame, None, views)
+        statuses.append(estimate.status)
+    assert statuses[1:] == [expected] * 7

@@ -157,4 +157,12 @@ MUTANTS = (
         "one sensor of four is believed where a blind one stands beside two that contradict it",
         ("test_faults.py",),
     ),
+    Mutant(
+        "tracking-lost-and-still-identified",
+        "tracking/tracker.py",
+        "return not data.was_lost and log_odds_other",
+        "return log_odds_other",
+        "a body that was carried away is ok where three markers of another thing are followed",
+        ("test_tracking_doubt.py",),
+    ),
 )

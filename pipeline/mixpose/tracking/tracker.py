@@ -360,8 +360,7 @@ def track_after(data: Frame, verdict: Verdict) -> Track:
         met_before=dict(zip(used.names, met.tolist(), strict=True)),
         delays=delays_after(data, best) if is_ok or late else track.delays,
         sensors_agreed=track.sensors_agreed or agreeing,
-        is_identified=is_ok
-        or (track.is_identified and log_odds_other(data, best) < data.rules.acceptance.log_doubt),
+        is_identified=is_ok or (track.is_identified and _is_the_same(data, best)),
         ok_count=track.ok_count + is_ok,
         elsewhere=_elsewhere_after(data, best),
         failing={**track.failing, **best.failing},
@@ -372,6 +371,11 @@ def track_after(data: Frame, verdict: Verdict) -> Track:
         log_odds_twice=track.log_odds_twice if verdict.second is None else verdict.second.log_odds,
         mistaken=track.mistaken if verdict.mistaken is None else verdict.mistaken,
     )
+
+
+def _is_the_same(data: Frame, best: ScoredPose) -> bool:
+    """Test whether a pose is that of the thing that was followed: not after that was lost."""
+    return not data.was_lost and log_odds_other(data, best) < data.rules.acceptance.log_doubt
 
 
 def _elsewhere_after(data: Frame, best: ScoredPose) -> float:
