@@ -11,7 +11,6 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.density import Observation
 from mixpose.errors import RecordingError
 from mixpose.frames import Source, numbers_of, prefetch, spread_over
 from mixpose.frames.images import ImageSequence
@@ -19,7 +18,7 @@ from mixpose.frames.source import Frames, is_same, shown_by
 from mixpose.frames.tables import DetectionTable
 from mixpose.frames.times import listed
 from mixpose.frames.video import Video
-from mixpose.records import Floats, Image, PointPattern, RawFrame
+from mixpose.records import Floats, Image, Pattern, PointPattern, RawFrame
 from mixpose.runner import observation_of
 from mixpose.session import SensorSetup, Session
 
@@ -84,7 +83,8 @@ def survey(
             number, data = frame.number, frame.data
             before = seen.add(frame, before)
             if not isinstance(data, np.ndarray) or to_count is None or number in to_count:
-                seen.count(frame, observation_of(session, setup, frame))
+                observation = observation_of(session, setup, frame)
+                seen.count(frame, observation.pattern, observation.found)
             done()
     counts = seen.counts
     return Survey(
@@ -134,14 +134,14 @@ class _Seen:
             self.doubled.append(number)
         return shown
 
-    def count(self, frame: RawFrame, observation: Observation) -> None:
+    def count(self, frame: RawFrame, pattern: Pattern, found: int) -> None:
         """Add the features that were extracted from a frame."""
-        number, pattern = frame.number, observation.pattern
+        number = frame.number
         self.counted.append(number)
         if isinstance(pattern, PointPattern):
-            self.counts.append(observation.found)
+            self.counts.append(found)
             self.features[number] = replace(frame, data=pattern)
-            is_empty = not observation.found
+            is_empty = not found
         else:
             is_empty = not np.ptp(pattern.values)
         if is_empty:
