@@ -222,6 +222,11 @@ def test_what_a_sensor_meets_far_off_by_the_noise_of_the_frame_it_may_see_elsewh
     assert not is_missed([one, close], np.zeros(2), agreed)
     # or as the noise of the frame has it
     assert not is_missed([one, far], np.zeros(2), agreed, variance=0.2)
+    # features of a body that gives way may be met off
+    judged = replace(scored(np.eye(4), one, far), variances=np.full(2, 1e-4))
+    rules = np.zeros(2), agreed, RULES, MODEL
+    assert is_seen_elsewhere(judged, *rules)
+    assert not is_seen_elsewhere(judged, *rules, is_exact=False)
 
 
 def test_one_sensor_of_four_is_not_believed_where_others_see_as_much_elsewhere(

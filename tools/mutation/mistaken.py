@@ -80,7 +80,7 @@ MUTANTS = (
     Mutant(
         "judgement-far-off-is-met",
         "judgement/acceptance.py",
-        "off = np.where(is_off, used.shares, 0.0).sum(axis=1)",
+        "off = np.where(is_off & is_exact, used.shares, 0.0).sum(axis=1)",
         "off = 0 * used.met",
         "a sensor that meets the body far off by chance, and sees it elsewhere, agrees",
         ("test_faults.py",),

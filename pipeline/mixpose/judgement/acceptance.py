@@ -314,7 +314,12 @@ def unconfirming_sensors(judged: ScoredPose, rules: AcceptanceRules) -> list[str
 
 
 def is_seen_elsewhere(
-    judged: ScoredPose, before: Floats, agreed: bool, rules: AcceptanceRules, model: NoiseModel
+    judged: ScoredPose,
+    before: Floats,
+    agreed: bool,
+    rules: AcceptanceRules,
+    model: NoiseModel,
+    is_exact: bool = True,  # False for a body whose features may be met off
 ) -> bool:
     """Test whether a single sensor meets most of the body while another sees as much elsewhere.
 
@@ -330,7 +335,7 @@ def is_seen_elsewhere(
     noise = dict(zip(judged.used.names, judged.variances.tolist(), strict=True))
     least = [[max(noise.get(name, 0.0), variance)] for name in used.names]
     is_off = model.errors.are_off(used, least + used.extra)
-    off = np.where(is_off, used.shares, 0.0).sum(axis=1)
+    off = np.where(is_off & is_exact, used.shares, 0.0).sum(axis=1)
     met = used.met - off
     coverage = used.coverage - off / np.maximum(used.expected + used.unseen, 1e-12)
     coverage, nearby, missed, count, met = (

@@ -213,7 +213,8 @@ def _contradiction_mistake(data: Frame, judged: ScoredPose) -> Mistake:
     """
     track, rules = data.track, (data.rules.acceptance, data.rules.judgement.noise)
     before = track.log_odds_mistaken(CONTRADICTION)
-    if is_seen_elsewhere(judged, _noise_before(data, judged), track.sensors_agreed, *rules):
+    known = _noise_before(data, judged), track.sensors_agreed
+    if is_seen_elsewhere(judged, *known, *rules, data.body.is_exact):
         before = _even_odds(data)
     elif before and has_two_agreeing(judged, *rules):
         before = 0.0
