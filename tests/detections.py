@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
+from mixpose.fit import EstimatorOptions
 from mixpose.objective import View, project_body
 from mixpose.objective.matched import STEPS_PER_SIGMA
 from mixpose.objective.paper import SampledTerm
 from mixpose.records import Estimate, PointPattern
-from mixpose.rigid import from_rotation_vector, perturb, transform
+from mixpose.rigid import from_rotation_vector, perturb, transform, twist_between
 from mixpose.sensors import Sensor
-from mixpose.tracking import Tracker
+from mixpose.tracking import Track, Tracker
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -63,6 +64,22 @@ def detect(
         clutter = rng.uniform(y.min(axis=0) - 100, y.max(axis=0) + 100, (false, y.shape[1]))
         views.append(view_of(str(k), sensor, np.concatenate([y, clutter]), sigma))
     return views
+
+
+def followed(frames: Iterable[tuple[Body, Floats, list[View]]]) -> list[tuple[Estimate, float]]:
+    """Estimates of frames of one body at true poses, ten a second, and their squared errors.
+
+    By their covariances, without a start.
+    """
+    told, tracker, track = list[tuple[Estimate, float]](), None, Track()
+    for k, (body, T, views) in enumerate(frames):
+        tracker = tracker or Tracker.create(body, EstimatorOptions())
+        track, estimate = tracker.advance(track if k else tracker.begin(), k, 0.1 * k, views)
+        assert estimate.T_world_object is not None
+        assert estimate.covariance is not None
+        away = twist_between(estimate.T_world_object, T)
+        told.append((estimate, float(away @ np.linalg.solve(estimate.covariance, away))))
+    return told
 
 
 def random_start(seed: int, length: float = 6.0, angle_deg: float = 3.0) -> Floats:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from detections import followed
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
@@ -16,7 +17,7 @@ from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions
 from mixpose.judgement import ahead
 from mixpose.objective import View
-from mixpose.records import Estimate, PointPattern
+from mixpose.records import PointPattern
 from mixpose.rigid import from_rotation_vector, perturb, transform, twist_between
 from mixpose.search.poses import spread_poses
 from mixpose.search.problem import SearchProblem, sensor_detections
@@ -62,21 +63,6 @@ def moving(seed: int, count: int, missing: float = 0.05) -> Iterator[Seen]:
         yield Seen(body, T, views)
 
 
-def followed(seed: int, count: int) -> list[tuple[Estimate, float]]:
-    """Estimates, and squared errors by their covariances."""
-    told = []
-    for k, (body, T, views) in enumerate(moving(seed, count)):
-        if k == 0:
-            tracker = Tracker.create(body, EstimatorOptions())
-            track = tracker.begin()
-        track, estimate = tracker.advance(track, k, 0.1 * k, views)
-        assert estimate.T_world_object is not None
-        assert estimate.covariance is not None
-        away = twist_between(estimate.T_world_object, T)
-        told.append((estimate, float(away @ np.linalg.solve(estimate.covariance, away))))
-    return told
-
-
 def second_frame(seed: int, missing: float = 0.05) -> tuple[Tracker, Frame]:
     (body, _, views), (_, _, then) = moving(seed, 2, missing)
     tracker = Tracker.create(body, EstimatorOptions())
@@ -87,7 +73,7 @@ def second_frame(seed: int, missing: float = 0.05) -> tuple[Tracker, Frame]:
 @pytest.mark.parametrize("seed", [112, 118])
 def test_a_pose_is_ok_only_where_no_other_maximum_is_likely(seed: int) -> None:
     # 27.9: one of 10,000 is farther off
-    told = followed(seed, 6)
+    told = followed(moving(seed, 6))
     assert [off for estimate, off in told if estimate.status == "ok" and off > 27.9] == []
     assert sum(estimate.status == "ok" for estimate, _ in told) >= 2
 

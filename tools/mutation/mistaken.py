@@ -80,8 +80,8 @@ MUTANTS = (
     Mutant(
         "judgement-far-off-is-met",
         "judgement/acceptance.py",
-        "off = np.where(is_off & is_exact, used.shares, 0.0).sum(axis=1)",
-        "off = 0 * used.met",
+        "close = replace(used, shares=np.where(is_off, 0.0, used.shares))",
+        "close = used",
         "a sensor that meets the body far off by chance, and sees it elsewhere, agrees",
         ("test_faults.py",),
     ),

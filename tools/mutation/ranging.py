@@ -147,8 +147,8 @@ MUTANTS = (
     Mutant(
         "tracking-ranges-sensors-never-fail",
         "tracking/ranges.py",
-        "return float(logit(frame.rules.acceptance.mistaken))",
-        "return -np.inf",
+        "self._unknown = float(logit(frame.rules.acceptance.mistaken))",
+        "self._unknown = -np.inf",
         "all ranges of a covered sensor count, each as one detection that is false by chance",
         (_FAULTS,),
     ),

@@ -31,6 +31,11 @@ _CLIMBS = 12
 _CLIMBED = 1e-6  # of the squared residuals: with a smaller gain, the fit has converged
 
 
+def deviations_of(covariance: Floats) -> Floats:
+    """Return standard deviations (G,) of parameters."""
+    return np.asarray(np.sqrt(np.maximum(covariance.diagonal(), 0.0)))
+
+
 @dataclass(frozen=True, eq=False)
 class Adjusted:
     """Rig and poses at the maximum."""
@@ -50,8 +55,7 @@ class Adjusted:
     @property
     def deviations(self) -> Floats:
         """Return standard deviations of the parameters (G,); infinite if not determined."""
-        deviations = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-        return np.where(self.undetermined, np.inf, deviations)
+        return np.where(self.undetermined, np.inf, deviations_of(self.covariance))
 
     @property
     def certainty(self) -> float:
@@ -168,7 +172,7 @@ def _take_step(bundle: Bundle, state: State, weighted: Sequence[Weighted]) -> tu
     if largest > _FARTHEST:
         share = _FARTHEST / largest
         step = replace(step, rig=step.rig * share, poses=step.poses * share)
-    deviations = np.sqrt(np.maximum(np.diag(step.covariance), 0.0))
+    deviations = deviations_of(step.covariance)
     ratios = step.rig[deviations > 0] / deviations[deviations > 0]
     size = float(np.abs(ratios).max(initial=0.0))
     if not bundle.count:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mixpose.body.symmetry import motions
-from mixpose.calibration.adjust import MET, Adjusted
+from mixpose.calibration.adjust import MET, Adjusted, deviations_of
 from mixpose.calibration.profile import Contradiction
 from mixpose.calibration.rig import Block, Rig, centre_of
 from mixpose.calibration.rules import CalibrationRules
@@ -91,11 +91,11 @@ class Calibration:
         """Return the calibration of parameters that are linear (G, G) in those of this one."""
         covariances = (self.covariance, self.of_biases, self.of_lenses)
         covariance, of_biases, of_lenses = (by_old @ C @ by_old.T for C in covariances)
-        deviations = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
+        is_known = np.isfinite(self.deviations)
         return replace(
             self,
             covariance=covariance,
-            deviations=np.where(np.isfinite(self.deviations), deviations, np.inf),
+            deviations=np.where(is_known, deviations_of(covariance), np.inf),
             of_biases=of_biases,
             of_lenses=of_lenses,
         )

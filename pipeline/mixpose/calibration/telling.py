@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mixpose.calibration import result
+from mixpose.calibration.adjust import deviations_of
 from mixpose.calibration.profile import Contradiction
 from mixpose.calibration.result import HELD_LENS, Calibration, Displacement
 from mixpose.calibration.rig import Block, Rig, centre_of, values_of
@@ -49,8 +50,7 @@ def _plus_minus(deviation: float, unit: str) -> str:
 def _held_lines(calibration: Calibration, unit: str) -> list[str]:
     """Name held errors that would move a parameter by more than its reported deviation."""
     lens, lines, deviations = HELD_LENS, list[str](), calibration.deviations
-    covariances = calibration.of_biases, calibration.of_lenses
-    biases, lenses = (np.sqrt(np.maximum(C.diagonal(), 0.0)) for C in covariances)
+    biases, lenses = map(deviations_of, (calibration.of_biases, calibration.of_lenses))
     is_length = np.array([u == "length" for block in calibration.blocks for u in block.units], bool)
     reported = np.where(np.isfinite(deviations) & is_length, deviations, np.inf)
     for moved, words, kind in (

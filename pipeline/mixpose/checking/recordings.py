@@ -77,11 +77,11 @@ def survey(
     """
     quick = quick or (isinstance(source, Video) and source.size is None)
     damage: Damage = []
-    seen, before = _Seen(), None
+    seen = _Seen()
     with closing(_frames(source, damage, quick=quick)) as frames:
         for frame in frames:
             number, data = frame.number, frame.data
-            before = seen.add(frame, before)
+            seen.add(frame)
             if not isinstance(data, np.ndarray) or to_count is None or number in to_count:
                 observation = observation_of(session, setup, frame)
                 seen.count(frame, observation.pattern, observation.found)
@@ -116,9 +116,10 @@ class _Seen:
     empty: list[int] = field(default_factory=list)
     doubled: list[int] = field(default_factory=list)
     repeated: list[int] = field(default_factory=list)
+    shown: NDArray[Any] | None = None  # by the last frame, if that tells
 
-    def add(self, frame: RawFrame, before: NDArray[Any] | None) -> NDArray[Any] | None:
-        """Add a frame after one that showed `before`; return what this one shows, if it tells."""
+    def add(self, frame: RawFrame) -> None:
+        """Add a frame."""
         number, data = frame.number, frame.data
         self.numbers.append(number)
         if frame.time_s is not None:
@@ -126,13 +127,13 @@ class _Seen:
         shown = shown_by(frame)
         if shown is not None and shown.size < _TELLING:
             shown = None
-        if shown is not None and shown.any() and is_same(before, shown):
+        if shown is not None and shown.any() and is_same(self.shown, shown):
             self.repeated.append(number)
+        self.shown = shown
         if isinstance(data, np.ndarray):
             self.size = (data.shape[1], data.shape[0])
         elif isinstance(data, PointPattern) and has_duplicates(data.points):
             self.doubled.append(number)
-        return shown
 
     def count(self, frame: RawFrame, pattern: Pattern, found: int) -> None:
         """Add the features that were extracted from a frame."""

@@ -192,7 +192,7 @@ class Summary:
         remarks, late = [], self.findings.late
         for name, delay in self.findings.delays.items():
             spread = f"(give or take {2 * delay.deviation:.4f})"
-            if name not in late and self.findings.stated_delays.get(name) == "estimate":
+            if self.findings.stated_delays.get(name) == "estimate":
                 estimated = f"{delay.seconds:.4f} s {spread}"
                 remarks.append(f"sensor {name!r}: delay estimated as {estimated}")
             elif name in late:

@@ -9,6 +9,7 @@ from mixpose.density.observation import (
     all_pairs as all_pairs,
     close_pairs as close_pairs,
     matched_atlas as matched_atlas,
+    nearest_of as nearest_of,
     pairs_by_picture as pairs_by_picture,
     peak as peak,
     render as render,

@@ -151,12 +151,7 @@ class Observation:
         """Keep detections within a reach, in σ_ε, of places (n, m); all if there are none."""
         if self.points is None or not len(y):
             return self
-        limit = reach * self.sigma
-        if len(self.points) * len(y) <= DRAWING.few_pairs:
-            away = self.points[:, None] - y
-            near = (np.vecdot(away, away) < limit * limit).any(axis=1)
-        else:
-            near = np.isfinite(cKDTree(y).query(self.points, distance_upper_bound=limit)[0])
+        near = nearest_of(self.points, y)[0] < (reach * self.sigma) ** 2
         return self.only(near) if near.any() else self
 
     def density(
@@ -239,6 +234,17 @@ def all_pairs(count: int) -> Indices:
     pairs = np.stack(np.triu_indices(count, 1), axis=1)
     pairs.flags.writeable = False
     return pairs
+
+
+def nearest_of(points: Floats, places: Floats) -> tuple[Floats, Indices]:
+    """Return squared distances (M,) of points (M, m) to the nearest of places (n, m), and which."""
+    if len(points) * len(places) > DRAWING.few_pairs:
+        distances, numbers = cKDTree(places).query(points)
+        return distances**2, numbers
+    away = points[:, None] - places
+    squared = np.vecdot(away, away)
+    numbers = squared.argmin(axis=1)
+    return squared[range(len(points)), numbers], numbers
 
 
 def self_overlap(points: Floats, weights: Floats, variance: float) -> float:

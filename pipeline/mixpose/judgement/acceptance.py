@@ -334,13 +334,12 @@ def is_seen_elsewhere(
     # what is met far off, by the noise of this frame too, may as well be seen elsewhere
     noise = dict(zip(judged.used.names, judged.variances.tolist(), strict=True))
     least = [[max(noise.get(name, 0.0), variance)] for name in used.names]
-    is_off = model.errors.are_off(used, least + used.extra)
-    off = np.where(is_off & is_exact, used.shares, 0.0).sum(axis=1)
-    met = used.met - off
-    coverage = used.coverage - off / np.maximum(used.expected + used.unseen, 1e-12)
+    is_off = model.errors.are_off(used, least + used.extra) & is_exact
+    close = replace(used, shares=np.where(is_off, 0.0, used.shares))
+    nearby = used.unmatched_nearby + used.met - close.met
     coverage, nearby, missed, count, met = (
         used.summed(values) / used.images
-        for values in (coverage, used.unmatched_nearby + off, used.missed + off, used.count, met)
+        for values in (close.coverage, nearby, close.missed, used.count, close.met)
     )
     *_, second, first = sorted(range(len(coverage)), key=coverage.tolist().__getitem__)
     if not coverage[second] < rules.agreeing <= coverage[first]:

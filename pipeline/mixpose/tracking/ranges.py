@@ -163,17 +163,6 @@ def _sum_and_shares(odds: Floats) -> tuple[Floats, Floats]:
     return total, shares
 
 
-def failing_before(frame: Frame) -> Floats:
-    """Return log odds (L, 1) that sensors fail, by the frames before."""
-    known, unknown = frame.track.failing, _unknown(frame)
-    return np.array([[known.get(view.name, unknown)] for view in frame.views])
-
-
-def _unknown(frame: Frame) -> float:
-    """Return the log odds that a sensor fails of which nothing is known."""
-    return float(logit(frame.rules.acceptance.mistaken))
-
-
 @dataclass(frozen=True, eq=False)
 class AssociationTerm:
     """The logarithm of `sum_associations`."""
@@ -181,6 +170,7 @@ class AssociationTerm:
     frame: Frame
     noise: float  # in σ_ε
     second: bool  # whether to give second derivatives, by differences of gradients
+    failing: Floats | float = -np.inf  # (L, 1) log odds that sensors fail
 
     def linearise(self, poses: Floats) -> Quadratic:
         """Return models at poses (H, 4, 4), with the curvature of known labels."""
@@ -205,8 +195,9 @@ class AssociationTerm:
 
     def _sum(self, poses: Floats) -> AssociationSum:
         frame = self.frame
-        detection, failing = frame.rules.judgement.detection, failing_before(frame)
-        return sum_associations(frame.views, frame.body, poses, self.noise, detection, failing)
+        detection = frame.rules.judgement.detection
+        arguments = frame.views, frame.body, poses, self.noise, detection, self.failing
+        return sum_associations(*arguments)
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,6 +232,10 @@ class AssociationLikelihood:
         self.frame = frame
         known = frame.track.residuals.of(RANGES)[:, 0]
         self._noise = noise_ratio(known, frame.rules.ranges)  # in σ_ε
+        # log odds that a sensor fails of which nothing is known, and (L, 1) by the frames before
+        self._unknown = float(logit(frame.rules.acceptance.mistaken))
+        failing = frame.track.failing
+        self._failing = np.array([[failing.get(v.name, self._unknown)] for v in frame.views])
 
     def fits(self, starts: Iterable[Start]) -> Iterator[tuple[Start, Fit]]:
         """Climb the posterior from all starts at once, and yield the ends, the best first.
@@ -289,9 +284,9 @@ class AssociationLikelihood:
         """Judge a pose by the sum over all associations and by the track's prior."""
         frame, T, rules = self.frame, fit.T_world_object, self.frame.rules
         model, before = rules.judgement, frame.track.residuals
-        failing, detection = failing_before(frame), model.detection
-        sums = sum_associations(frame.views, frame.body, T[None], self._noise, detection, failing)
-        shown = np.maximum(failing - sums.by_sensor, _unknown(frame))[:, 0].tolist()
+        arguments = frame.views, frame.body, T[None], self._noise, model.detection
+        sums = sum_associations(*arguments, self._failing)
+        shown = np.maximum(self._failing - sums.by_sensor, self._unknown)[:, 0].tolist()
         count = int(frame.free.sum())
         degrees = max(float(sums.met[0]) - count, 0.0)
         squares = float(sums.squares[0]) if degrees else 0.0
@@ -361,7 +356,8 @@ class AssociationLikelihood:
 
     def _posterior(self, noise: float, *, second: bool) -> Sum:
         """Return the posterior for ranges with errors of `noise` σ_ε, and the track's prior."""
-        return Sum((AssociationTerm(self.frame, noise, second), ExpectedTerm(self.frame)))
+        term = AssociationTerm(self.frame, noise, second, self._failing)
+        return Sum((term, ExpectedTerm(self.frame)))
 
     def _definite(self, model: Quadratic) -> Floats:
         """Return minus the Hessian (k, k), with small positive values where it is not definite."""

@@ -18,14 +18,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.density import DRAWING
+from mixpose.density import nearest_of
 from mixpose.judgement import ScoredPose
 from mixpose.objective import View, project_body
-from mixpose.records import Floats, Indices, Mask, PointPattern, replace
+from mixpose.records import Floats, Mask, PointPattern, replace
 from mixpose.rigid import cross
 
 _TINY = float(np.finfo(np.float64).tiny)
@@ -147,7 +146,8 @@ def weighed_by_size(
         (seen,) = images.seen[k, 0].nonzero()
         if not (isinstance(pattern, PointPattern) and pattern.has_radii and seen.size):
             continue
-        scales = all_scales[k, seen[_nearest(pattern.points, images.y[k, 0, seen])]]
+        _, nearest = nearest_of(pattern.points, images.y[k, 0, seen])
+        scales = all_scales[k, seen[nearest]]
         logs = np.log(pattern.radii / scales)
         now = sizes.centre_now(logs, centre, rules)
         off, whole = logs - now, scales * np.exp(now)
@@ -161,14 +161,6 @@ def weighed_by_size(
         known = pattern.with_errors(np.maximum(pattern.deviations, deviations), cut)
         seen_otherwise[k] = replace(view, observation=replace(view.observation, pattern=known))
     return seen_otherwise
-
-
-def _nearest(points: Floats, places: Floats) -> Indices:
-    """Return which of places (n, 2) is nearest to each of points (M, 2)."""
-    if len(points) * len(places) > DRAWING.few_pairs:
-        return np.asarray(cKDTree(places).query(points)[1])
-    offsets = points[:, None] - places
-    return np.asarray(np.vecdot(offsets, offsets).argmin(axis=1))
 
 
 def are_cut_otherwise(views: Sequence[View], known: Sequence[View]) -> bool:
